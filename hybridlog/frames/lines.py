@@ -24,6 +24,7 @@ from hybridlog.schema.arrow_types import (
     structs,
 )
 from hybridlog.schema.column import Records
+from hybridlog_storage.errors import UsageError
 
 if TYPE_CHECKING:
     from collections.abc import Iterator, Sequence
@@ -112,7 +113,12 @@ def cells(table: pa.Table, *, exact: bool = False, most: int = MAX_CELL) -> list
 
     `exact` numbers have all digits that tell them apart, not six.
     """
-    columns = [[_cell(value, exact=exact, most=most) for value in each] for each in table.columns]
+    try:
+        columns = [[_cell(one, exact=exact, most=most) for one in each] for each in table.columns]
+    except OverflowError as error:
+        raise UsageError(
+            f"A time is too far away to be shown ({error}). In SQL, `::varchar` makes it text."
+        ) from error
     return [list(row) for row in zip(*columns, strict=True)]
 
 
@@ -124,7 +130,7 @@ def _cell(value: pa.Scalar, *, exact: bool, most: int = MAX_CELL) -> str:
     elif types.is_floating(kind):
         text = _exact(value) if exact else f"{value.as_py():.6g}"
     elif types.is_timestamp(kind):
-        text = _time(value)
+        text = format_time(value.value * UNITS[kind.unit])
     elif types.is_duration(kind):
         text = format_duration(value.value)
     elif is_bytes(kind):
@@ -136,28 +142,13 @@ def _cell(value: pa.Scalar, *, exact: bool, most: int = MAX_CELL) -> str:
     elif is_list(kind):
         text = _list(value.values, inner)
     else:
-        text = _cut(_plain(value), most)
+        text = _cut(str(value.as_py()), most)
     return text
-
-
-def _plain(value: pa.Scalar) -> str:
-    try:
-        return str(value.as_py())
-    except OverflowError:  # DuckDB has infinite dates
-        return f"{value.value} days"
 
 
 def _exact(value: pa.Scalar) -> str:
     """The shortest digits that give a number back in its type."""
     return str(numpy_type(value.type).type(value.as_py())).removesuffix(".0")
-
-
-def _time(value: pa.Scalar) -> str:
-    ns = value.value * UNITS[value.type.unit]
-    try:
-        return format_time(ns)
-    except OverflowError:  # DuckDB has later years than 9999
-        return f"{ns} ns"
 
 
 def _pairs(pairs: Iterable[tuple[str, str]]) -> str:

@@ -18,6 +18,7 @@ from importlib import import_module
 from math import inf
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Final, TypeVar
+from weakref import proxy
 
 import pyarrow as pa
 from msgspec.structs import replace
@@ -26,7 +27,7 @@ from hybridlog.query.answers.completeness import completeness_of
 from hybridlog.query.question import Question
 from hybridlog.schema.states import without_fields
 from hybridlog.sql.content import TREE, StoreContent, paths_named
-from hybridlog.sql.views import Reading, TopicDataset
+from hybridlog.sql.views import Names, Reading, TopicDataset
 from hybridlog.wording import MAX_ROWS, arrow_html, meant
 from hybridlog_storage.errors import HybridlogError, ResourceError, TopicError, UsageError, extra
 from hybridlog_storage.stopping import at_safe_points, safe_point
@@ -201,7 +202,7 @@ class SqlEngine:
     ) -> SqlAnswer:
         """Prepare a query; of several statements, all but the last are run.
 
-        What they create is there until the answer is dropped.
+        What it creates is there as long as its answer.
 
         Args:
             text: One statement or several.
@@ -223,8 +224,26 @@ class SqlEngine:
             if most not in self._bases:
                 self._bases[most] = open_duckdb(most)
             cursor = self._bases[most].cursor()
-        content = self.content(scope)
-        return SqlAnswer(content, cursor, text, params, memory=most, timeout=timeout)
+        with explained(most):
+            statements = list(cursor.extract_statements(text))
+        if not statements:
+            raise UsageError("The query is empty.")
+        named = None
+        if [*map(_kind, statements)] == ["SELECT"]:
+            sql = statements[0].query.strip().rstrip(";")
+            named = paths_named(cursor.cursor().execute(TREE, [sql]).fetchone()[0])
+        else:  # what it creates is its own
+            cursor = open_duckdb(most).cursor()
+        return SqlAnswer(
+            self.content(scope),
+            cursor,
+            text,
+            statements,
+            params,
+            named=named,
+            memory=most,
+            timeout=timeout,
+        )
 
     def content(self, scope: Question = EVERYWHERE) -> StoreContent:
         """Recordings and views of a scope as they are now."""
@@ -258,25 +277,19 @@ class SqlAnswer:
         content: StoreContent,
         cursor: Any,
         text: str,
+        statements: Sequence[Any],
         params: Params,
         *,
+        named: Names,
         memory: int,
         timeout: float | None,
     ) -> None:
         self._content, self._cursor, self._memory = content, cursor, memory
-        self._timeout = timeout
-        with explained(memory):
-            statements = list(cursor.extract_statements(text))
-        if not statements:
-            raise UsageError("The query is empty.")
-        named = None
-        if len(statements) == 1 and _kind(statements[0]) == "SELECT":
-            sql = statements[0].query.strip().rstrip(";")
-            named = paths_named(cursor.cursor().execute(TREE, [sql]).fetchone()[0])
-        self.reading = Reading(named)
+        self._timeout, self.reading = timeout, Reading(named)
+        own = proxy(self)  # nothing that the cursor has keeps the answer
         for name in content.named(text):
             view = content.view(name)
-            source = TopicDataset(view, lambda: self.reading) if view else content.table(name)
+            source = TopicDataset(view, lambda: own.reading) if view else content.table(name)
             cursor.register(name, source)
         for statement in statements:
             self._done: pa.Table | None = None  # of a statement that changes something

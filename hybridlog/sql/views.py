@@ -134,11 +134,6 @@ class ViewColumn(Struct, frozen=True):
             return pa.nulls(len(records), self.type)
         return fitted(summary(here) if self.is_summary and is_array(here.type) else here, self.kind)
 
-    @classmethod
-    def of_points(cls, kind: Any) -> ViewColumn:
-        """The column of the points of clouds, of a type."""
-        return cls(POINTS, (POINTS,), kind, sql_type(kind), is_points=True)
-
 
 def field_of(columns: Any, name: str) -> Any:
     """A field of structs, null where these are; None without it."""
@@ -173,9 +168,7 @@ def _columns(message: Any, path: FieldPath, reserved: frozenset[str]) -> Iterato
 
 def _may_be_summary(kind: Any) -> bool:
     """True if tables may hold an array as a summary."""
-    if _types.is_fixed_size_list(kind):
-        return bool(kind.list_size > LIMIT)
-    return is_array(kind)
+    return is_array(kind) and (not _types.is_fixed_size_list(kind) or kind.list_size > LIMIT)
 
 
 def merged(kinds: Sequence[Any]) -> Any:
@@ -281,7 +274,9 @@ class TopicView:
         columns = view_columns(merged(kinds) if kinds else pa.struct([]))
         self._columns = {column.name: column for column in columns}
         if POINTS not in self._columns and (points := self._points()):
-            self._columns[POINTS] = ViewColumn.of_points(merged(points))
+            kind = merged(points)
+            made = ViewColumn(POINTS, (POINTS,), kind, sql_type(kind), is_points=True)
+            self._columns[POINTS] = made
         fields = [pa.field(column.name, column.type) for column in self._columns.values()]
         self.schema = pa.schema([*OWN, *fields])
         self._chosen = [resolved[one] for one in ids if one in resolved]

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import weakref
+
 import duckdb
 import pytest
 
@@ -187,8 +189,12 @@ def test_parameters_and_several_statements(store: hl.Store) -> None:
     for params in (5, "5"):
         with pytest.raises(UsageError, match="a list"):
             store.sql("select count(*) from large where i8 = ?", params)  # type: ignore[arg-type]
-    made = store.sql("create table few as select * from scan limit 7; select count(*) from few")
-    assert made.rows() == [(7,)]
+    for _ in range(2):  # what it creates is its own
+        made = store.sql("create table few as select * from scan limit 7; select count(*) from few")
+        assert made.rows() == [(7,)]
+    gone = weakref.ref(made)
+    del made
+    assert gone() is None  # with its connection
     # What a view of the user reads is not in the text of the next query.
     own = "create view v as select echo from scan where angle < 1; select max(v.echo.far[1]) from v"
     assert store.sql(own).rows() == [(0.25,)]
