@@ -188,20 +188,12 @@ def shown(content: bytes, rows: int, columns: int) -> dict[str, Any]:
 
 
 def _times(table: pa.Table) -> list[int | None]:
-    if found := _values(table, "t", pa.types.is_int64):
-        return found
-    if not (column := _values(table, "log_time", pa.types.is_timestamp)):
+    names = table.column_names
+    if names.count("t") == 1 and types.is_int64(table["t"].type):
+        return list(table["t"].to_pylist())
+    if names.count("log_time") != 1 or not types.is_timestamp(table["log_time"].type):
         return []
-    unit = UNITS[table.schema.field("log_time").type.unit]
-    return [None if value is None else value * unit + unit - 1 for value in column]
-
-
-def _values(table: pa.Table, name: str, fits: Callable[[pa.DataType], bool]) -> list[Any]:
-    """The values of a column, times as integers; none without it, or if its type is another."""
-    place = table.schema.get_field_index(name)
-    if place < 0 or not fits(table.schema.field(place).type):
-        return []
-    column = table.column(place)
-    if pa.types.is_timestamp(column.type):
-        column = column.cast(pa.int64())
-    return list(column.to_pylist())
+    column = table["log_time"]
+    unit = UNITS[column.type.unit]
+    values = column.cast(pa.int64()).to_pylist()
+    return [None if value is None else value * unit + unit - 1 for value in values]
