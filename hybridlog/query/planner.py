@@ -49,11 +49,14 @@ class Planner(Rows):
     ) -> None:
         super().__init__(session, Counters() if counters is None else counters)
         self.question = question
+        self._resolved: list[Resolved] | None = None
 
-    @lazy
+    @property
     def resolved(self) -> list[Resolved]:
         """The recordings to ask, oldest first, each with its range."""
-        return resolved(self.session, self.question)
+        if self._resolved is None:
+            self._resolved = resolved(self.session, self.question)
+        return self._resolved
 
     def parts(self) -> list[Part]:
         """The question, split by recording and topic, where it may have an answer.

@@ -71,8 +71,6 @@ _ORDERS: dict[str, np.ufunc] = {
     ">": np.greater,
     ">=": np.greater_equal,
 }
-_ENDS: Final = {"<": "min", "<=": "min", ">": "max", ">=": "max"}
-"""The end of an array that tells whether an order holds for any of its elements."""
 
 
 class Verdict(NamedTuple):
@@ -205,20 +203,11 @@ class _Columns:
             for one in _apart(found):
                 yield from self._leaves(one, node, is_in_list=is_in_list)
         elif self._left and is_summary(kind):
-            yield self._end(found, node)
-        elif is_in_list and node.op in _ENDS and pa.types.is_floating(kind):
+            yield found._replace(values=None)
+        elif is_in_list and node.op in {"<", "<=", ">", ">="} and pa.types.is_floating(kind):
             yield found.some(np.isfinite(to_numpy(found.values)))
         else:
             yield found
-
-    def _end(self, found: _Values, node: Condition) -> _Values:
-        """The ends of arrays, if these tell what is asked of the elements."""
-        place = found.values.type.get_field_index(_ENDS.get(node.op, ""))
-        if place >= 0 and self._types.known and not (found.is_element or node.field.is_absolute):
-            values = pc.struct_field(found.values, [place])
-            if self._types.are_floats(node.field.names) or pa.types.is_integer(values.type):
-                return found._replace(values=values, is_element=True).valid()
-        return found._replace(values=None)
 
     def _at(self, target: Field) -> Iterator[_Values]:
         """The values at a path, whole arrays, statistics of arrays; none of them null."""

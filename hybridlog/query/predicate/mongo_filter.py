@@ -41,6 +41,10 @@ _OPERATORS = {
     *("$exists", "$type", "$size", "$mod", "$regex", "$options"),
     *("$bitsAllSet", "$bitsAllClear", "$bitsAnySet", "$bitsAnyClear"),
 }
+_INDEXED = {"_id", "_meta.inserted_at", "_meta.error"} | {
+    f"_meta.ref{part}" for part in ("", ".seg", ".chunk", ".off", ".len")
+}
+"""What documents have and messages do not."""
 _PLACE = re.compile(r"0|[1-9][0-9]{0,8}")
 
 Filter = dict[str, object]
@@ -70,7 +74,7 @@ def mongo_filter(
         raise _refused((), str(error)) from None
     if len(content) > MAX_BYTES:
         raise _refused((), "it is too large")
-    asked = (Condition(_field(path), "exists") for path in paths if not _is_id(path))
+    asked = (Condition(_field(path), "exists") for path in paths if path not in _INDEXED)
     check(Predicate(And(tuple(asked)), str(query)), types)
     root = MongoFilter(content, tuple(paths.items())) if found else ALWAYS
     return Predicate(root, str(query))
@@ -84,7 +88,7 @@ def misjudged(node: MongoFilter, types: FieldTypes | Mapping[str, str] | None) -
     known = FieldTypes.of(types)
     found: dict[str, Filter] = {}
     for path, of_value in node.paths:
-        if is_meta(path) or _is_id(path):
+        if is_meta(path) or path == "_id":
             continue
         names = [name for name in path.split(".") if not name.isdecimal()]
         name, parent = ".".join(names), ".".join(names[:-1])
@@ -124,10 +128,6 @@ def _is_summary(value: str) -> Filter:
 def _field(path: str) -> Field:
     first, *rest = path.split(".")
     return Field((first, *(int(part) if _PLACE.fullmatch(part) else part for part in rest)))
-
-
-def _is_id(path: str) -> bool:
-    return path.split(".", maxsplit=1)[0] == "_id"
 
 
 def _plain(value: Any) -> object:

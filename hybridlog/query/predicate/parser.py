@@ -284,8 +284,6 @@ _VALUE_WORDS: dict[str, Value | None] = {
 }
 _ENDS = frozenset({")", "and", "&&", "or", "||"})
 """Keywords behind a topic of which any message will do."""
-_ONLY_INDEXED = frozenset({"inserted_at", "error", "ref"})
-"""Fields of `_meta` that index documents have and messages do not."""
 
 
 def parse(text: str) -> Predicate:
@@ -294,6 +292,11 @@ def parse(text: str) -> Predicate:
         raise WhereError(f"a predicate is text, not {type(text).__name__}")
     if is_filter(text):
         raise WhereError("MongoDB filters are not possible here: write a predicate, such as x > 1")
+    return _parsed(text)
+
+
+@lru_cache(maxsize=128)  # for a small topic, parsing takes as long as the answer
+def _parsed(text: str) -> Predicate:
     return _Parser(text).parse()
 
 
@@ -448,12 +451,6 @@ class _Parser:
             found = self._field()
             self._close(")")
             return replace(found, is_absolute=True)
-        if token.path[0] == "_meta" and not _ONLY_INDEXED.isdisjoint(token.path[1:2]):
-            path = Field(token.path).path
-            problem = (
-                f'only MongoDB has {path}; ask with a filter: {{"{path}": {{"$exists": true}}}}'
-            )
-            raise self._fail(token, problem)
         return Field(token.path, position=token.position)
 
     def _value(self) -> Value | None:

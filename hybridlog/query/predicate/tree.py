@@ -13,7 +13,7 @@ from typing import Any, Final, Literal, NamedTuple, TypeAlias, cast
 
 from msgspec import Struct, field
 
-from hybridlog.schema.definition_text import FLOATS, NUMBERS, TIMES
+from hybridlog.schema.definition_text import NUMBERS, TIMES
 from hybridlog.wording import listed, meant
 from hybridlog_storage.cache import lazy
 from hybridlog_storage.errors import WhereError
@@ -239,7 +239,7 @@ def nodes(node: Node) -> Iterator[Node]:
 
 
 Stat = Literal["n", "min", "max", "mean"]
-Kind = Literal["number", "string", "bool", "time", "datetime", "other"]
+Kind = Literal["number", "string", "bool", "time", "other"]
 
 STATS: dict[str, Stat] = {"n": "n", "min": "min", "max": "max", "mean": "mean"}
 """Names of the statistics in the summary of an array."""
@@ -253,7 +253,6 @@ _KINDS: dict[str, Kind] = {
     "bool": "bool",
     "boolean": "bool",
     "string": "string",
-    "date": "datetime",
     **dict.fromkeys(TIMES, "time"),
     **dict.fromkeys({*NUMBERS, "number", "integer"}, "number"),
 }
@@ -272,17 +271,11 @@ _COLUMNS = {
 }
 """Columns of tables that are no fields, and what predicates call them."""
 _META = {
-    "_meta.inserted_at": "date",
     "_meta.t": "time",
     "_meta.pub": "time",
     "_meta.rec": "string",
     "_meta.topic": "string",
     "_meta.seq": "int64",
-    "_meta.ref.seg": "int32",
-    "_meta.ref.chunk": "int64",
-    "_meta.ref.off": "int64",
-    "_meta.ref.len": "int64",
-    "_meta.error": "string",
 }
 
 
@@ -334,10 +327,6 @@ class FieldTypes(Struct, frozen=True):
         """True if a field, the elements of an array, or its ends are of float32."""
         is_end = self.statistic(parts) in {"min", "max"}
         return self.base(Field(parts[:-1] if is_end else parts).names) == "float32"
-
-    def are_floats(self, path: str) -> bool:
-        """True if a field, or the elements of an array, are floating-point numbers."""
-        return self.base(path) in FLOATS
 
 
 @lru_cache(maxsize=64)

@@ -146,7 +146,7 @@ def test_nan() -> None:
         ("x[3:2] == 1", "slice is empty", 1),
         ("x < 1 < 2", "expected 'and'", 6),
         ("_id == 5", "_meta.t", 0),
-        ("_meta.inserted_at < 5", "only MongoDB has _meta.inserted_at", 0),
+        ("_meta.inserted_at < 5", "no field _meta.inserted_at", 0),
         ("_meta.tt < 5", "did you mean _meta.t", 0),
         ("_meta.rec == 5", "quotes", 13),
         ("x == -'a'", "expected a number", 6),
