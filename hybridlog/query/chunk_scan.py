@@ -14,7 +14,7 @@ from collections.abc import Callable, Iterator, Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from functools import partial
 from itertools import groupby
-from operator import itemgetter
+from operator import attrgetter, itemgetter
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -204,7 +204,9 @@ class ChunkScan(Struct):
         ends = np.cumsum([task.chunk.place.length for task in tasks]) // room
         for _, numbered in groupby(zip(ends.tolist(), tasks, strict=True), itemgetter(0)):
             group = [task for _, task in numbered]
-            for segment, own in groupby(sorted(group, key=_key), lambda task: task.key[:2]):
+            for segment, own in groupby(
+                sorted(group, key=attrgetter("key")), lambda task: task.key[:2]
+            ):
                 places = [(task.scan.recording, task.chunk.place) for task in own]
                 reader = self.session.segment(places[0][0], segment[1])
                 reader.fetch([place for _, place in places])
@@ -284,10 +286,6 @@ class ChunkScan(Struct):
             else:
                 rest.append(run)
         return ready, rest
-
-
-def _key(task: _Task) -> ChunkKey:
-    return task.key
 
 
 def in_order(runs: Sequence[MessageRun], *, reverse: bool = False) -> MessageRun:

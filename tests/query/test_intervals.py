@@ -21,7 +21,7 @@ from hypothesis import strategies as st
 import hybridlog as hl
 from hybridlog.query.answers.interval_queries import rows_differ
 from hybridlog.query.intervals import Interval, Intervals, changing, holding
-from hybridlog_storage.errors import TimeError, UsageError, WhereError
+from hybridlog_storage.errors import HybridlogError, TimeError, UsageError, WhereError
 from hybridlog_storage.messages import Channel
 from hybridlog_storage.segments.segment_writer import SegmentSettings
 from tests.independent import write_mcap
@@ -358,35 +358,34 @@ def test_the_cost_is_counted_and_no_payload_is_read(plain: hl.Store) -> None:
     assert near.to_pandas().attrs["hybridlog"]["chunks_read"] <= 2
 
 
-def test_wrong_questions_say_what_is_wrong(plain: hl.Store) -> None:
-    state = plain.topic("/state")
-    for wrong in (state.limit(1), state.every(2), state.reverse()):
-        with pytest.raises(UsageError, match="cannot be combined"):
-            wrong.intervals()
-        with pytest.raises(UsageError, match="cannot be combined"):
-            wrong.changes("s")
-    for wrong in (state.limit(1), state.every(2)):
-        with pytest.raises(UsageError, match="cannot be combined"):
-            state.windows("100ms").containing(wrong)
+@pytest.mark.parametrize(
+    ("ask", "error", "words"),
+    [
+        (lambda s: s.limit(1).intervals(), UsageError, "cannot be combined"),
+        (lambda s: s.every(2).changes("s"), UsageError, "cannot be combined"),
+        (lambda s: s.reverse().intervals(), UsageError, "cannot be combined"),
+        (lambda s: s.windows("1s").containing(s.limit(1)), UsageError, "cannot be combined"),
+        (lambda s: s.clock("publish").between("+1s", "+2s").intervals(), UsageError, "publish"),
+        (lambda s: s.intervals(max_gap=0), UsageError, "max_gap is 0"),
+        (lambda s: s.intervals(state="on"), UsageError, "choose held, not held or unknown"),
+        (lambda s: s.changes(), UsageError, "Name at least one field"),
+        (lambda s: s.changes("s", tolerance=math.nan), UsageError, "tolerance"),
+        (lambda s: s.windows(), UsageError, "give before, after or both"),
+        (lambda s: s.windows("soon"), TimeError, "not a duration"),
+        (lambda s: s.between("2020-01-01", "2020-01-02").intervals(), TimeError, "Nothing was"),
+        (lambda s: s.during(s.intervals()).at("+1s"), UsageError, "during"),
+        (lambda s: s.where("s <").intervals(), WhereError, "expected a value"),
+    ],
+)
+def test_wrong_questions(
+    plain: hl.Store, ask: Callable[[hl.Query], object], error: type[HybridlogError], words: str
+) -> None:
+    with pytest.raises(error, match=words):
+        ask(plain.topic("/state"))
+
+
+def test_intervals_are_one_topics(plain: hl.Store) -> None:
     with pytest.raises(UsageError, match="name one of /other, /state"):
         plain.all_topics().intervals()
-    with pytest.raises(UsageError, match="cannot use the publish clock"):
-        state.clock("publish").between("+1s", "+2s").intervals()
-    with pytest.raises(UsageError, match="max_gap is 0"):
-        state.intervals(max_gap=0)
-    with pytest.raises(UsageError, match="Name at least one field"):
-        state.changes()
-    with pytest.raises(UsageError, match="tolerance"):
-        state.changes("s", tolerance=math.nan)
-    with pytest.raises(UsageError, match="give before, after or both"):
-        state.windows()
     with pytest.raises(UsageError, match="one topic"):
         plain.all_topics().limit(1).windows("1s")
-    with pytest.raises(TimeError, match="not a duration"):
-        state.windows("soon")
-    with pytest.raises(TimeError, match="Nothing was recorded"):
-        state.between("2020-01-01", "2020-01-02").intervals()
-    with pytest.raises(UsageError, match="during"):
-        plain.topic("/state").during(state.intervals()).at("+1s")
-    with pytest.raises(WhereError):
-        state.where("s <").intervals()

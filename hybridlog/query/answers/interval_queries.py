@@ -296,8 +296,11 @@ class IntervalQueries:
         carried = None if before is None else before.records[-1:]
         found = [_NONE]
         for rows in ask(_bounded(part, span)):
-            differs, carried = steps(carried, rows.records, tolerance)
-            found.append(rows.log_time[differs])
+            whole = joined([rows.records] if carried is None else [carried, rows.records])
+            numbers = np.arange(len(whole))
+            differs = rows_differ(whole, numbers, np.maximum(numbers - 1, 0), tolerance)
+            found.append(rows.log_time[differs[len(whole) - len(rows.log_time) :]])
+            carried = whole[-1:]
         return np.concatenate(found)
 
     def _check(self, subject: str) -> None:
@@ -392,19 +395,6 @@ def _question_about(
 
 
 # Comparison of messages: numbers by value, strings by bytes, lists by length and elements.
-
-
-def steps(
-    carried: pa.StructArray | None, rows: pa.StructArray, tolerance: float
-) -> tuple[NDArray[np.bool_], pa.StructArray]:
-    """The rows that differ from the row before them (bool[n]), and the last row.
-
-    `carried` is the row before the first one, if there is one.
-    """
-    whole = rows if carried is None else joined([carried, rows])
-    numbers = np.arange(len(whole))
-    differs = rows_differ(whole, numbers, np.maximum(numbers - 1, 0), tolerance)
-    return differs[len(whole) - len(rows) :], whole[-1:]
 
 
 def rows_differ(

@@ -32,7 +32,6 @@ from hybridlog.query.predicate.tree import (
     Stat,
     Value,
     is_meta,
-    root_of,
 )
 from hybridlog.schema.arrow_types import (
     is_array,
@@ -86,13 +85,13 @@ class Verdict(NamedTuple):
 
 
 def on_columns(
-    node: Predicate | Node, types: Types, records: pa.StructArray, *, left: bool = False
+    predicate: Predicate, types: Types, records: pa.StructArray, *, left: bool = False
 ) -> Verdict:
     """Evaluate a predicate on messages with at least its fields.
 
     Arrays may be structs of `n`, `min`, `max` and `mean`, or of `n`, if they are `left`.
     """
-    return _Columns(FieldTypes.of(types), records, left=left).verdict(root_of(node))
+    return _Columns(FieldTypes.of(types), records, left=left).verdict(predicate.root)
 
 
 class _Values(NamedTuple):

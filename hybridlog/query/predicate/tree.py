@@ -220,11 +220,6 @@ def is_meta(path: str) -> bool:
     return path == "_meta" or path.startswith("_meta.")
 
 
-def root_of(node: Predicate | Node) -> Node:
-    """The tree of a predicate; a node is returned as it is."""
-    return node.root if isinstance(node, Predicate) else node
-
-
 def nodes(node: Node) -> Iterator[Node]:
     """All nodes of a tree but those of other topics, parents first, from left to right."""
     yield node

@@ -15,7 +15,7 @@ import pytest
 from hybridlog.query.predicate.evaluate import on_columns
 from hybridlog.query.predicate.mongo_filter import mongo_filter
 from hybridlog.query.predicate.parser import parse
-from hybridlog.query.predicate.tree import Condition, Field
+from hybridlog.query.predicate.tree import Condition, Field, Predicate
 from hybridlog.schema.arrow_types import objects_array
 
 ORDERS = {
@@ -57,7 +57,7 @@ def test_numbers_are_compared_by_value(name: str, order: str) -> None:
     for bound in bounds:
         asked = Condition(Field(("x",)), order, (bound,))  # type: ignore[arg-type]
         records = pa.StructArray.from_arrays([pa.array(values)], ["x"])
-        mask = on_columns(asked, {"x": name}, records).holds
+        mask = on_columns(Predicate(asked), {"x": name}, records).holds
         given = Fraction(as_single(bound) if name == "float32" else bound)
         expected = [ORDERS[order](Fraction(v), given) for v in values.tolist()]
         assert mask.tolist() == expected, bound
