@@ -79,8 +79,8 @@ class Tabular(Forced, AsJson):
     output: Path | None = output_option("Write to this file")
     limit: int | None = option("At most so many.", "N", short="-n", type=click.IntRange(min=0))
 
-    def __post_init__(self) -> None:
-        """Refuse what cannot be written, before a store is opened."""
+    def __init__(self, **values: Any) -> None:
+        super().__init__(**values)
         self.check()
 
     @property

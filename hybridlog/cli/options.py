@@ -1,4 +1,4 @@
-"""Options of commands: a command is bound to the dataclass of its options.
+"""Options of commands: a command is bound to the class of its options.
 
 Each field is a parameter of the command; options that several commands share are fields of a base
 class, and help shows those of a class before those of its bases. Parameters say which others they
@@ -11,11 +11,10 @@ import inspect
 import time
 from collections.abc import Callable, Iterable, Sequence
 from contextlib import AbstractContextManager
-from dataclasses import Field, dataclass, field, fields
 from functools import wraps
 from itertools import chain
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, ClassVar, Final, TypeVar, dataclass_transform
+from typing import TYPE_CHECKING, Any, ClassVar, Final, NamedTuple, TypeVar, dataclass_transform
 
 import click
 from click.core import ParameterSource
@@ -32,21 +31,21 @@ if TYPE_CHECKING:
     from hybridlog.recordings import Recordings
     from hybridlog.store import Store
 
-_MAKE, _NEEDS, _EXCLUDES = "hybridlog.parameter", "hybridlog.needs", "hybridlog.excludes"
 _Kind = TypeVar("_Kind")
 PATH: Final = click.Path(readable=False, path_type=Path)
 """A path that click does not check: the library's errors name a cure and have exit codes."""
 _TYPES: Final = {"int": int, "float": float, "Path": PATH}
 
 
-@dataclass(frozen=True)
 class Amount(click.ParamType[Any]):
     """A number that is typed with a unit, and read by `parse`; so are its bounds."""
 
-    parse: Callable[[str], float]
-    least: str = "0"
-    most: str | None = None
-    name: str = "amount"  # for click
+    name = "amount"  # for click
+
+    def __init__(
+        self, parse: Callable[[str], float], least: str = "0", most: str | None = None
+    ) -> None:
+        self.parse, self.least, self.most = parse, least, most
 
     def convert(self, value: Any, param: click.Parameter | None, ctx: click.Context | None) -> Any:
         """The number."""
@@ -135,15 +134,20 @@ def _completed(context: click.Context, param: click.Parameter, incomplete: str) 
     return [name for name in names if name.startswith(incomplete)]
 
 
+class _Parameter(NamedTuple):
+    """A field of options: makes the parameter of its name and type, and has its rules."""
+
+    make: Callable[[str, str], click.Parameter]
+    needs: Sequence[str] = ()
+    excludes: Sequence[str] = ()
+
+
 @dataclass_transform(kw_only_default=True, frozen_default=True)
 class Options:
-    """A base class of options: each class below it is a frozen dataclass."""
+    """A base class of options: its fields are given by name."""
 
-    __dataclass_fields__: ClassVar[dict[str, Field[Any]]]
-
-    def __init_subclass__(cls) -> None:
-        """Make a class a dataclass, whose fields are given by name."""
-        dataclass(frozen=True, kw_only=True)(cls)
+    def __init__(self, **values: Any) -> None:
+        self.__dict__.update(values)
 
 
 def option(
@@ -178,7 +182,7 @@ def option(
         made.__dict__.update({"section": section} if section else {})
         return made
 
-    return field(metadata={_MAKE: make, _NEEDS: needs, _EXCLUDES: excludes})
+    return _Parameter(make, needs, excludes)
 
 
 def argument(
@@ -199,21 +203,16 @@ def argument(
         settings.setdefault("required", None if of == annotation else False)
         return click.Argument([field], help=help, metavar=metavar, **settings)
 
-    return field(metadata={_MAKE: make})
+    return _Parameter(make)
 
 
 def parameters_of(kind: type) -> list[click.Parameter]:
     """The parameters of a command, those of a class before those of its bases."""
     types: dict[str, str] = {}
     for one in kind.__mro__:
-        for name, annotation in inspect.get_annotations(one).items():
-            types.setdefault(name, annotation)
-    made = {one.name: one.metadata.get(_MAKE) for one in fields(kind)}
-    return [
-        make(name, annotation)
-        for name, annotation in types.items()
-        if (make := made.get(name)) is not None
-    ]
+        types = {**types, **inspect.get_annotations(one), **types}
+    found = ((getattr(kind, name, None), name, types[name]) for name in types)
+    return [one.make(name, of) for one, name, of in found if isinstance(one, _Parameter)]
 
 
 def check(kind: type, context: click.Context) -> None:
@@ -231,13 +230,13 @@ def check(kind: type, context: click.Context) -> None:
         and context.params[name] not in (None, (), False)
     }
     values = {f"{name}={value}" for name, value in context.params.items()}
-    for one in (each for each in fields(kind) if each.name in given):
-        name, wanted = spelled[one.name], one.metadata.get(_NEEDS, ())
-        needs = [each.partition("=") for each in wanted if each.partition("=")[0] in spelled]
-        if needs and not (given | values).intersection(wanted):
-            others = " or ".join(value or spelled[field] for field, _, value in needs)
+    for field, one in ((each, getattr(kind, each)) for each in spelled if each in given):
+        name = spelled[field]
+        needs = [each.partition("=") for each in one.needs if each.partition("=")[0] in spelled]
+        if needs and not (given | values).intersection(one.needs):
+            others = " or ".join(value or spelled[each] for each, _, value in needs)
             raise UsageError(f"{name} is for {others}: add that, or leave out {name}.")
-        for other in filter(given.__contains__, one.metadata.get(_EXCLUDES, ())):
+        for other in filter(given.__contains__, one.excludes):
             raise UsageError(
                 f"{name} and {spelled[other]} exclude each other: leave out one of them."
             )

@@ -10,7 +10,6 @@ import threading
 import time
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from contextlib import suppress
-from dataclasses import dataclass
 from itertools import chain, islice, zip_longest
 from typing import Any, Final, Self
 
@@ -245,8 +244,7 @@ _LEFT: Final = frozenset({"text", "time", "second"})
 Get = str | int | Callable[[Any], object]
 
 
-@dataclass(frozen=True, slots=True)
-class Column:
+class Column(Struct, frozen=True):
     """A column of a table.
 
     Attributes:

@@ -374,8 +374,7 @@ def test_the_command_line(plain: Path, tmp_path: Path, monkeypatch: pytest.Monke
     done = answer(*to, "--task", "wave", store=plain)
     assert "2 episodes, 120 frames" in done.err
     check(Path("set"), dict.fromkeys(range(2), 30 * MS), [80, 40])
-    answer(*to, "--task", "wave", store=plain, code=2)
-    assert answer(*to, "--task", "wave", "--force", "-q", store=plain).err == ""
+    answer(*to, "--task", "wave", "--force", store=plain, code=2)
     for wrong in (
         ("export", "x.mcap", "--fps", "3"),
         ("export", "x", "-F", "lerobot"),
@@ -391,26 +390,6 @@ def test_the_command_line(plain: Path, tmp_path: Path, monkeypatch: pytest.Monke
             recording.write(Channel("/cmd_vel", "ros1", twist, {}), bytes(48), log_time=START)
         (action,) = proposed(store.all_topics()).vectors["action"]
     assert (action.topic, action.paths) == ("/cmd_vel", ("linear.x", "angular.z"))
-
-
-def test_only_a_set_of_hybridlog_is_replaced_and_by_a_whole_one(
-    plain: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    monkeypatch.chdir(tmp_path)
-    Path("map.yaml").write_text(FeatureMap.of(MAP).to_yaml())
-    to = ("export", "set", "-F", "lerobot", "--map", "map.yaml", "-f", "--task", "wave", "--fps")
-    answer(*to, str(FPS), store=plain)
-    before = every_file(Path("set"))
-    answer(*to, "2000", store=plain, code=2)
-    answer(*to, str(FPS), "--between", "+1h", "+2h", store=plain, code=2)
-    assert every_file(Path("set")) == before
-    answer(*to, "10", store=plain)
-    assert json.loads(Path("set/meta/info.json").read_text())["fps"] == 10
-    assert sorted(path.name for path in tmp_path.iterdir()) == ["map.yaml", "set"]
-    Path("set/meta/hybridlog.json").unlink()  # somebody else's
-    before = every_file(Path("set"))
-    answer(*to, str(FPS), store=plain, code=2)
-    assert every_file(Path("set")) == before
 
 
 def test_depth_has_one_scale_nan_is_a_gap_and_numbers_keep_their_type(tmp_path: Path) -> None:

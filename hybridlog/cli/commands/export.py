@@ -1,40 +1,55 @@
-"""`hybridlog export`."""
+"""`hybridlog export` and `copy`."""
 
 from __future__ import annotations
 
-import shutil
-from collections import Counter
-from collections.abc import Iterable, Sequence
+import sys
+from collections.abc import Iterator, Sequence
 from contextlib import nullcontext, suppress
+from dataclasses import asdict
+from functools import partial
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, Final, Literal
+from typing import TYPE_CHECKING, Final, Literal
 
 import click
 
-from hybridlog.cli import output
-from hybridlog.cli.answers import (
-    check_room,
-    form_of,
-    latched,
-    write_answer,
-    write_bytes,
+from hybridlog.cli import options, output
+from hybridlog.cli.answers import check_room, form_of, latched, write_answer, write_bytes
+from hybridlog.cli.options import (
+    Amount,
+    AsJson,
+    Choosing,
+    Forced,
+    InStore,
+    Latched,
+    Options,
+    Quiet,
+    Topics,
+    argument,
+    command,
+    option,
 )
-from hybridlog.cli.options import Forced, Latched, Options, Topics, argument, command, option
 from hybridlog.cli.output import Bar
+from hybridlog.cli.signals import watch
 from hybridlog.formats import OUTPUTS, formats_of, suffixes_of
+from hybridlog.wording import parse_size
 from hybridlog_storage.disk.files import undone
 from hybridlog_storage.errors import (
     DefinitionError,
     HybridlogError,
     PayloadError,
+    StoreError,
     TimeError,
+    TopicError,
     UsageError,
 )
 
 if TYPE_CHECKING:
     from hybridlog.formats.slices import Front
+    from hybridlog.maintenance.copying import CopyOptions, CopyReport
+    from hybridlog.query.choice import Choice
     from hybridlog.query.query import Query
     from hybridlog.store import Store
+
 
 _LOGS = formats_of("log")
 _FILES = formats_of("table", "lines", "video")
@@ -44,9 +59,7 @@ _FILES = formats_of("table", "lines", "video")
 _LEROBOT: Final = "lerobot"
 
 
-def _option(help: str, metavar: str | None = None, **settings: Any) -> Any:  # noqa: A002
-    needs = (f"form={_LEROBOT}",)
-    return option(help, metavar, needs=needs, section="With lerobot", **settings)
+_option: Final = partial(option, needs=(f"form={_LEROBOT}",), section="With lerobot")
 
 
 class _Training(Options):
@@ -82,7 +95,7 @@ class _Training(Options):
     )
 
 
-class _Given(Topics, Latched, Forced, _Training):
+class _Export(Topics, Latched, Forced, _Training):
     target: Path = argument(
         "File (mcap, bag) or directory (rosbag2, lerobot, mp4, tables).", "OUTPUT"
     )
@@ -116,8 +129,8 @@ class _Given(Topics, Latched, Forced, _Training):
         return Front(latched=not self.no_latched, original_times=self.original_times)
 
 
-@command(_Given)
-def export_command(given: _Given) -> None:
+@command(_Export)
+def export_command(given: _Export) -> None:
     """Export whole recordings; tables get one file a topic.
 
     `lerobot` makes a training set for robot learning.
@@ -148,7 +161,7 @@ def export_command(given: _Given) -> None:
             output.remarks(one.completeness().sentences)
 
 
-def _write_log(query: Query, form: str, path: Path, given: _Given) -> None:
+def _write_log(query: Query, form: str, path: Path, given: _Export) -> None:
     from hybridlog.attachments import extras_of
 
     extras = extras_of(query.source.now(), query.question)
@@ -165,10 +178,11 @@ def _write_log(query: Query, form: str, path: Path, given: _Given) -> None:
         output.note("A bag has no attachments and metadata records of the log; an MCAP file has.")
 
 
-def _write_tables(store: Store, query: Query, form: str, directory: Path, given: _Given) -> None:
+def _write_tables(store: Store, query: Query, form: str, directory: Path, given: _Export) -> None:
     """Write one file a topic, except topics that do not fit or have no message in the range."""
     from hybridlog.query.planner import resolved
     from hybridlog.query.query import narrowed
+    from hybridlog_storage.mongo.index_documents import collection_of
 
     resolved(query.source.now(), query.question)  # refuses a range without any message
     topics: Sequence[str] = query.topics
@@ -179,10 +193,8 @@ def _write_tables(store: Store, query: Query, form: str, directory: Path, given:
         topics = [topic for topic in topics if topic in found]
         if not topics:
             raise UsageError("There is no topic of images or of video.")
-    paths = {
-        topic: directory / f"{name}{OUTPUTS[form].suffixes[0]}"
-        for topic, name in _names(topics).items()
-    }
+    suffix = OUTPUTS[form].suffixes[0]
+    paths = {topic: directory / f"{collection_of(topic)}{suffix}" for topic in topics}
     for path in paths.values():
         check_room(path, force=given.force)
     left_out: list[HybridlogError] = []
@@ -208,19 +220,6 @@ def _write_tables(store: Store, query: Query, form: str, directory: Path, given:
             query.counters.add(one.counters)
         if len(left_out) == len(paths):
             raise left_out[0]
-
-
-def _names(topics: Iterable[str]) -> dict[str, str]:
-    """A name of a file for each topic; names that differ in their case alone get a number."""
-    from hybridlog_storage.mongo.index_documents import collection_of
-
-    found, seen = {}, Counter[str]()
-    for topic in topics:
-        name = collection_of(topic)
-        seen[name.casefold()] += 1
-        number = seen[name.casefold()]
-        found[topic] = name if number == 1 else f"{name}~{number}"
-    return found
 
 
 def _print_written(path: Path, query: Query, topic: str = "") -> None:
@@ -249,7 +248,7 @@ def _pieces(query: Query, how: str, target: Path) -> list[tuple[Path, Query]]:
     return found
 
 
-def _export_set(store: Store, query: Query, target: Path, given: _Given) -> None:
+def _export_set(store: Store, query: Query, target: Path, given: _Export) -> None:
     """Write a training set, or propose a map for one."""
     if given.propose_map:
         from hybridlog.training.episodes import proposed
@@ -263,9 +262,6 @@ def _export_set(store: Store, query: Query, target: Path, given: _Given) -> None
             "Name a map with --map FILE. `hybridlog export map.yaml --format lerobot "
             "--propose-map` writes one to begin with."
         )
-    # Only a set of hybridlog is replaced, once the new one is whole.
-    is_ours = given.force and (target / "meta" / "hybridlog.json").is_file()
-    place = target.resolve().with_name(f"{target.resolve().name}.new") if is_ours else target
     done, counted = 0, output.counted
     with Bar(target.name) as bar:
 
@@ -277,7 +273,7 @@ def _export_set(store: Store, query: Query, target: Path, given: _Given) -> None
         report = store.to_lerobot(
             query,
             given.features,
-            place,
+            target,
             fps=given.fps,
             episodes_by=given.episodes_by,
             task=given.task,
@@ -287,10 +283,6 @@ def _export_set(store: Store, query: Query, target: Path, given: _Given) -> None
             depth_scale=given.depth_scale,
             progress=tell,
         )
-    if is_ours:
-        old = target.resolve().rename(place.with_suffix(".old"))
-        place.rename(target.resolve())
-        shutil.rmtree(old)
     about = (
         f"{target}: {counted(report.episodes, 'episode')}, "
         f"{counted(report.frames, 'frame')} at {given.fps} Hz, {output.size(report.bytes)}"
@@ -305,3 +297,122 @@ def _export_set(store: Store, query: Query, target: Path, given: _Given) -> None
     if report.lost:
         lost = f"{counted(report.lost, 'message')} of these topics are lost in the episodes"
         output.note(f"{lost}; meta/hybridlog.json says in which.")
+
+
+_RUNNING: Final = frozenset({"open", "unfinished"})
+
+
+_RATE: Final = Amount(lambda text: parse_size(text.removesuffix("/s")), "1B/s")
+
+
+class _Copy(Choosing, InStore, AsJson, Quiet):
+    names: tuple[str, ...] = options.names_argument()  # type: ignore[misc]
+    to: str | None = argument("A directory, ssh://user@host/path, or s3://bucket/path.", "[TO]")
+    source: Path | None = option(
+        "Instead of TO: copy from this store, a directory or s3://bucket/path, into the one here.",
+        "STORE",
+        name="--from",
+    )
+    only_fields: bool = option("Fields first; a later copy adds the payloads.")
+    then_expire: bool = option(
+        "Delete payloads here once their copy is proved there; pinned ones stay."
+    )
+    limit_rate: float | None = option("Bytes a second at most, such as 5MB/s.", "RATE", type=_RATE)
+    check: bool = option("Prove copies that are there already, too, and mend them.")
+    watch: bool = option("Go on with what ends later, until Ctrl-C.")
+    ssh: str | None = option(
+        "The ssh program, with options; without, ssh.",
+        "COMMAND",
+        envvar="HYBRIDLOG_SSH",
+        show_envvar=True,
+    )
+
+
+@command(_Copy, "copy")
+def copy_command(given: _Copy) -> None:
+    """Copy recordings to or from another store.
+
+    It is a directory, a server over ssh, or a bucket. Every byte is proved there before a
+    recording is seen. After a cut, run it again: it goes on where it stopped. A recording that is
+    there already is not copied again.
+    """
+    from hybridlog.maintenance.copying import CopyOptions
+
+    if given.source is not None:
+        given = _from_elsewhere(given, given.source)
+    if given.to is None:
+        raise UsageError("Name the place to copy to, or with --from STORE the one to copy from.")
+    how = CopyOptions(
+        given.only_fields, given.then_expire, given.limit_rate, given.ssh, given.check
+    )
+    with given.opened() as store:
+        if given.watch:
+            look = partial(_look, store, given, how, set[str]())
+            watch(store.directory.place, look)
+            return
+        report = _copied(store, given, given.choice, how)
+    if left := [*report.refused.values(), *report.problems]:
+        sys.stdout.flush()
+        raise StoreError(" ".join(left))
+
+
+def _from_elsewhere(given: _Copy, source: Path) -> _Copy:
+    """The same as a copy by the other store, to the one here."""
+    from hybridlog.store import store_path
+    from hybridlog_storage.settings import NONE
+
+    if given.mongo is not None:
+        with given.opened(create=True):
+            pass
+    names = given.names if given.to is None else (*given.names, given.to)
+    to = str(store_path(given.store))
+    changed = {"names": names, "to": to, "store": source, "mongo": NONE}
+    return _Copy(**{**vars(given), **changed})
+
+
+def _copied(
+    store: Store,
+    given: _Copy,
+    chosen: Choice | list[str],
+    how: CopyOptions,
+    *,
+    is_short: bool = False,
+) -> CopyReport:
+    """Copy recordings and print what was copied, also if an error ends it."""
+    from hybridlog.maintenance.copying import CopyReport
+
+    assert given.to is not None
+    report, there = CopyReport(), "there" if given.source is None else "here"
+    lacking = f"; payloads that were deleted {there} were not copied"
+    try:
+        with Bar("copy") as bar:
+            store.copy(given.to, chosen, how, bar.part, report)
+    finally:
+        if sys.exception() is None or report != CopyReport():
+            lines = [f"copied {name}" for name in report.copied]
+            lines += (
+                f"{name} is {there} already{lacking if name in report.lacking else ''}"
+                for name in (() if is_short else report.known)
+            )
+            if report.freed_bytes > 0:  # of a few messages, fields may take more than payloads
+                lines.append(f"{output.size(report.freed_bytes)} freed")
+            output.tell(asdict(report), lines, at_once=is_short)
+    return report
+
+
+def _look(store: Store, given: _Copy, how: CopyOptions, done: set[str]) -> Iterator[StoreError]:
+    """Copy what has ended and is not `done`; yields why something was not copied."""
+    store.shared.recover()
+    chosen = store.choose(given.choice).summaries
+    new = [one.id for one in chosen if one.id not in done and one.status not in _RUNNING]
+    if not new:
+        return
+    try:
+        report = _copied(store, given, new, how, is_short=True)
+    except TopicError:
+        return  # one was removed since it was chosen
+    done.update({*new}.difference(report.held))
+    problems = [*report.refused.values(), *report.problems]
+    if report.held:
+        raise StoreError(" ".join(problems))
+    yield from map(StoreError, problems)
