@@ -41,8 +41,6 @@ _SHOW_CURSOR: Final = "\r\x1b[K\x1b[?25h"
 
 _AWAY: Final = (BucketError, DatabaseError, ResourceError, StoreError)
 """Errors that may have gone at a later look."""
-_LONGER: Final = 5
-"""Pause after such an error, as a multiple of the usual one."""
 
 
 class Stopped(BaseException):
@@ -113,8 +111,7 @@ def watch(
 ) -> None:
     """Call `look`, which acts and yields problems, again and again; a signal ends this normally.
 
-    A problem is reported once, as long as it lasts. While a place or a database is away, the pause
-    is longer.
+    A problem is reported once, as long as it lasts.
     """
     if isinstance(sys.stdout, io.TextIOWrapper):  # a file and a pipe show each line at once
         sys.stdout.reconfigure(line_buffering=True)
@@ -122,19 +119,18 @@ def watch(
     with contextlib.suppress(Stopped), stopping.at_safe_points():
         output.remarks([f"Watching {place}. Ctrl-C ends it."])
         while True:
-            met, wait_s = list[HybridlogError](), pause_s
+            met = list[HybridlogError]()
             try:
                 met.extend(look())
             except _AWAY as error:
                 # Ctrl-C may have ended a program that the other side needs.
                 stopping.safe_point()
                 met.append(error)
-                wait_s *= _LONGER
             for problem in met:
                 if str(problem) not in told:
                     report(problem)
             told = {*map(str, met)}
-            stopping.pause(wait_s)
+            stopping.pause(pause_s)
 
 
 def write_note(text: str) -> None:

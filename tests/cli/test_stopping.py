@@ -11,10 +11,7 @@ from pathlib import Path
 import pytest
 from pymongo import MongoClient
 
-from hybridlog.cli.signals import Stopped
-from hybridlog.formats.writing import Sink
 from tests import places
-from tests.calls import Calls
 from tests.independent import read_bag
 from tests.servers.mongods import Mongod
 from tests.waiting import wait_for
@@ -132,15 +129,6 @@ def test_a_signal_never_finds_a_lock_that_it_leaves_held(
     assert ended.stdout.count("interrupted: undone") == len(LOCKED)
     assert "Traceback" not in ended.stdout
     assert places.names(fresh) == ["small"]
-
-
-def test_a_directory_of_tables_is_complete_or_absent(
-    store: Path, tmp_path: Path, calls: Calls
-) -> None:
-    calls.fail(Sink, "commit", Stopped(signal.SIGINT))
-    with pytest.raises(Stopped):
-        run("export", tmp_path / "new", "-F", "csv", "-r", "robot", store=store)
-    assert [*tmp_path.iterdir()] == []
 
 
 @pytest.fixture

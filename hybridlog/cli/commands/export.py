@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import sys
 from collections.abc import Iterator, Sequence
-from contextlib import nullcontext, suppress
+from contextlib import suppress
 from dataclasses import asdict
 from functools import partial
 from pathlib import Path
@@ -32,7 +32,6 @@ from hybridlog.cli.output import Bar
 from hybridlog.cli.signals import watch
 from hybridlog.formats import OUTPUTS, formats_of, suffixes_of
 from hybridlog.wording import parse_size
-from hybridlog_storage.disk.files import undone
 from hybridlog_storage.errors import (
     DefinitionError,
     HybridlogError,
@@ -139,8 +138,6 @@ def export_command(given: _Export) -> None:
     if str(target) == "-":
         raise UsageError("export writes files; for a pipe: `hybridlog fetch '**' -F mcap -o -`.")
     form = given.form or form_of(target, suffixes_of(_LOGS))
-    if form in _LOGS and split is None:
-        check_room(target, force=given.force)
     with given.opened(snapshot=True) as store:
         query = given.query(store)
         if not query.topics:
@@ -180,6 +177,7 @@ def _write_log(query: Query, form: str, path: Path, given: _Export) -> None:
 
 def _write_tables(store: Store, query: Query, form: str, directory: Path, given: _Export) -> None:
     """Write one file a topic, except topics that do not fit or have no message in the range."""
+    from hybridlog.formats.writing import failures
     from hybridlog.query.planner import resolved
     from hybridlog.query.query import narrowed
     from hybridlog_storage.mongo.index_documents import collection_of
@@ -198,28 +196,22 @@ def _write_tables(store: Store, query: Query, form: str, directory: Path, given:
     for path in paths.values():
         check_room(path, force=given.force)
     left_out: list[HybridlogError] = []
-
-    def remove() -> None:
+    with failures(str(directory)):
+        directory.mkdir(parents=True, exist_ok=True)
+    for topic, path in paths.items():
+        one = narrowed(query, topic)
+        try:
+            write_answer(one, form, path, front=given.front)
+        except (DefinitionError, PayloadError, TimeError, UsageError) as error:
+            output.note(f"{topic}: {error}")
+            left_out.append(error)
+            continue
+        _print_written(path, one, topic)
+        query.counters.add(one.counters)
+    if len(left_out) == len(paths):
         with suppress(OSError):  # there are files in it
             directory.rmdir()
-
-    with nullcontext() if directory.is_dir() else undone(remove):
-        try:
-            directory.mkdir(parents=True, exist_ok=True)
-        except OSError as error:
-            raise UsageError(f"{directory} cannot be made: {error.strerror}.") from error
-        for topic, path in paths.items():
-            one = narrowed(query, topic)
-            try:
-                write_answer(one, form, path, front=given.front)
-            except (DefinitionError, PayloadError, TimeError, UsageError) as error:
-                output.note(f"{topic}: {error}")
-                left_out.append(error)
-                continue
-            _print_written(path, one, topic)
-            query.counters.add(one.counters)
-        if len(left_out) == len(paths):
-            raise left_out[0]
+        raise left_out[0]
 
 
 def _print_written(path: Path, query: Query, topic: str = "") -> None:

@@ -202,11 +202,18 @@ class Rosbag1Source(Source):
 
     def _open(self) -> None:
         magic = self._file.read(len(MAGIC))
-        if magic != MAGIC:
-            raise SourceError(_not_version_2(self.path, magic))
         record = self._record(len(MAGIC))
-        if record is None and self.size_bytes < len(MAGIC) + 4096:
-            raise SourceError(_not_version_2(self.path, magic))
+        if MAGIC.startswith(magic) and record is None and self.size_bytes < len(MAGIC) + 4096:
+            raise SourceError(
+                f"{self.path}: the file ends before any message; copy it again from where it was "
+                "recorded"
+            )
+        if magic != MAGIC:
+            version = magic.split(b"V", 1)[-1].strip().decode(errors="replace")
+            raise SourceError(
+                f"{self.path}: a ROS bag of version {version}, only 2.0 can be read; "
+                "convert it with `rosbag fix` or `rosbag reindex` of ROS 1"
+            )
         if record is None or record.op != _BAG_HEADER:
             return
         if encryptor := record.fields.get(b"encryptor"):
@@ -455,16 +462,3 @@ class Rosbag1Source(Source):
         self, offset: int | None, length: int | None, reason: str, lost: int | None = None
     ) -> None:
         self.note(Damage(self.path, offset, length, reason, lost))
-
-
-def _not_version_2(path: Path, magic: bytes) -> str:
-    if MAGIC.startswith(magic):
-        what = "ends before any message" if magic else "is empty"
-        return f"{path}: the file {what}; copy it again from where it was recorded"
-    if magic.startswith((b"#ROSBAG V", b"#ROSRECORD")):
-        version = magic.split(b"V", 1)[-1].strip().decode(errors="replace")
-        return (
-            f"{path}: a ROS bag of version {version}, only 2.0 can be read; "
-            "convert it with `rosbag fix` or `rosbag reindex` of ROS 1"
-        )
-    return f"{path}: no ROS 1 bag; it does not start with {MAGIC.decode().strip()!r}"

@@ -31,8 +31,6 @@ if TYPE_CHECKING:
     from pathlib import Path
     from typing import Any
 
-MAGIC = b"SQLite format 3\x00"
-
 _MIN_ROWID = -(2**63)
 
 
@@ -248,8 +246,6 @@ def _read_header(path: Path) -> tuple[int, int]:
             data = file.read(100)
     except OSError as error:
         raise cannot_open(path, error) from error
-    if not data.startswith(MAGIC):
-        raise SourceError(f"{path}: no SQLite database; give the .db3 file of a ROS 2 bag")
     page = int.from_bytes(data[16:18], "big")
     return 1 << 16 if page == 1 else page, int.from_bytes(data[28:32], "big")
 
