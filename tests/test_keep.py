@@ -16,7 +16,7 @@ from typing import Any
 import pytest
 
 import hybridlog as hl
-from hybridlog.cli.commands.serve import unplayed
+from hybridlog.cli.commands.open import unplayed
 from hybridlog.entries import summary_of
 from hybridlog.maintenance import keep as keeping
 from hybridlog.maintenance.edit import pin_of

@@ -51,36 +51,28 @@ def of_os_error(error: OSError) -> int:
 
 
 GROUPS: Final = {
-    "Record": {"record": "record", "mark": "recordings", "top": "top"},
-    "Look": {
-        "ls": "recordings", "info": "info", "view": "serve", "open": "serve", "plot": "measure",
-    },
-    "Ask": {
-        "fetch": "fetch", "intervals": "measure", "stats": "measure", "align": "ask",
-        "sql": "ask", "tf": "ask", "check": "measure", "diff": "measure",
-    },
-    "Export": {"export": "export", "copy": "export", "mcp": "serve"},
-    "Maintain": {
-        "tag": "recordings", "edit": "recordings", "keep": "maintain", "index": "maintain",
-        "verify": "maintain", "rm": "recordings", "demo": "demo",
-    },
-}  # fmt: skip
-"""The modules of the commands by group, in the order of the help text."""
+    "Record": ["record", "mark", "top"],
+    "Look": ["ls", "info", "view", "open", "plot"],
+    "Ask": ["fetch", "intervals", "stats", "align", "sql", "tf", "check", "diff"],
+    "Export": ["export", "copy", "mcp"],
+    "Maintain": ["tag", "edit", "keep", "index", "verify", "rm", "demo"],
+}
+"""Names of the commands by group, in the order of the help text."""
 
-COMMANDS: Final = {name: module for group in GROUPS.values() for name, module in group.items()}
-"""All commands, and the modules in which they lie."""
+COMMANDS: Final = [name for group in GROUPS.values() for name in group]
+"""Names of all commands, each of which lies in the module of its name."""
 
 
 class _LazyGroup(click.Group):
-    """A group whose command `name` is the function `name_command` in its module."""
+    """A group whose command `name` is the function `name_command` in the module of its name."""
 
     def list_commands(self, ctx: click.Context) -> list[str]:
-        return [*COMMANDS]
+        return COMMANDS
 
     def get_command(self, ctx: click.Context, cmd_name: str) -> click.Command | None:
         if cmd_name not in COMMANDS:
             return None
-        module = import_module(f"hybridlog.cli.commands.{COMMANDS[cmd_name]}")
+        module = import_module(f"hybridlog.cli.commands.{cmd_name}")
         command: click.Command = getattr(module, f"{cmd_name}_command")
         return command
 

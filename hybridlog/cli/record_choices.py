@@ -203,7 +203,7 @@ class RecordChoices(Between, Latched, InStore, AsJson, Quiet):
 
 def row_of(report: RecordReport, path: object) -> dict[str, Any]:
     """A recorded log as a row of JSON: that of `ls`, and what came of the log."""
-    from hybridlog.cli.commands.recordings import recording_dict
+    from hybridlog.cli.commands.ls import recording_dict
     from hybridlog.entries import summary_of
     from hybridlog.record.losses import losses_of
 

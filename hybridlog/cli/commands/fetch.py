@@ -163,7 +163,7 @@ def _answer(query: Query, choices: _Choices) -> Query:
 
 def _follow(query: Query, choices: _Choices) -> None:
     """Print messages as they come, then what they may lack."""
-    from hybridlog.cli.commands.recordings import status_text
+    from hybridlog.cli.commands.ls import status_text
     from hybridlog.query.query import Query
 
     following = query.follow(*(choices.topics or query.topics))

@@ -14,8 +14,8 @@ from msgspec.structs import asdict
 
 from hybridlog.cli import options, output
 from hybridlog.cli.answers import check_room
-from hybridlog.cli.commands.maintain import pin_dict
-from hybridlog.cli.commands.recordings import recording_dict, status_text
+from hybridlog.cli.commands.keep import pin_dict
+from hybridlog.cli.commands.ls import recording_dict, status_text
 from hybridlog.cli.options import (
     AsJson,
     Choosing,

@@ -1,22 +1,17 @@
-"""`hybridlog view`, `open`, `mcp`: recordings for browsers, viewers and assistants."""
+"""`hybridlog open`: recordings for viewers."""
 
 from __future__ import annotations
 
 import sys
-from pathlib import Path
 from typing import TYPE_CHECKING, Final
 
 import click
 
 from hybridlog.cli import output
 from hybridlog.cli.options import (
-    AsJson,
     Filtered,
-    InStore,
-    Place,
     Served,
     command,
-    one_recording,
     option,
 )
 from hybridlog.cli.signals import ended_by_signal
@@ -25,45 +20,6 @@ from hybridlog_storage.errors import extra
 
 if TYPE_CHECKING:
     from hybridlog.query.query import Query
-
-
-class _View(InStore, AsJson, Served):
-    recording: str | None = one_recording(
-        "Show this one first; without, the list of recordings.", "[RECORDING]"
-    )
-    token: Path | None = option(
-        "Take the token of the address from this file, which is made if it is not there: with "
-        "--port, links stay right after a restart.",
-        "FILE",
-    )
-
-
-@command(_View)
-def view_command(given: _View) -> None:
-    """Look at recordings in the browser.
-
-    The page has a timeline, plots, pictures and scans, and takes questions. Only this computer
-    can open it, at an address with a secret token. The store is only read. Ctrl-C ends it.
-    """
-    from urllib.parse import quote
-
-    with extra("view", "The view needs starlette and uvicorn"):
-        from hybridlog.view.guard import token_of
-        from hybridlog.view.server import ViewServer
-    with given.opened() as store:
-        token = token_of(given.token) if given.token is not None else ""
-        server = ViewServer(store, given.port or 0, token)
-        url = server.url
-        if given.recording is not None:
-            entry = store.entry(given.recording)
-            url += f"#recording={quote(entry.name, safe='')}"
-        shown: dict[str, object] = {"url": url, "port": server.port}
-        output.tell(shown, [url])
-        if not given.as_json:
-            output.note("Open this address in a browser. Ctrl-C ends the server.")
-        sys.stdout.flush()
-        with ended_by_signal(server.stop):
-            server.run()
 
 
 _PORT: Final = 8765
@@ -129,18 +85,3 @@ def unplayed(query: Query) -> list[str]:
     found = listed(sorted(topics), _MAX_SHOWN)
     said = f"Messages without their payload are not played; there are some of {found}."
     return [said] if topics else []
-
-
-@command(Place)
-def mcp_command(given: Place) -> None:
-    """Answer the questions of an assistant, which starts it.
-
-    It speaks the Model Context Protocol over standard input and output. The store is only read;
-    answers are bounded and say what they lack.
-    """
-    with extra("mcp", "mcp needs the package of this protocol"):
-        from hybridlog.view.tool_server import serve
-    from hybridlog.store import open_store
-
-    with open_store(given.store, read_only=True) as opened:
-        serve(opened)
