@@ -17,14 +17,14 @@ from typing import TYPE_CHECKING, Protocol, TypeVar
 import numpy as np
 
 from hybridlog.entries import put_entry, schemas_in, summary_of, topic_types
-from hybridlog.query.chunk_columns import PARTS, ChunkColumns
+from hybridlog.query.chunk_columns import PARTS, Chunk, ChunkColumns
 from hybridlog.query.question import Question, RecordedChannel, field_types
 from hybridlog.query.topics import resolve
 from hybridlog.record.marks import MARKS
-from hybridlog.snapshot import UNFINISHED, differing
+from hybridlog.snapshot import UNFINISHED, Snapshot, differing
 from hybridlog.wording import counted, listed
-from hybridlog_storage.catalog import WHOLE, file_of
-from hybridlog_storage.disk.directory import gone
+from hybridlog_storage.catalog import WHOLE, RecordingEntry, RecordingSummary, file_of
+from hybridlog_storage.disk.directory import StoreDirectory, gone
 from hybridlog_storage.errors import (
     ChangedError,
     SegmentError,
@@ -32,21 +32,16 @@ from hybridlog_storage.errors import (
     TopicError,
 )
 from hybridlog_storage.messages import Channel, Schema
-from hybridlog_storage.segments.chunk_table import place_of
+from hybridlog_storage.segments.chunk_table import ChunkPlace, ChunkTable, place_of
 from hybridlog_storage.times import END, placed
 
 if TYPE_CHECKING:
     from numpy.typing import NDArray
 
     from hybridlog.columns.tables import Tables, TopicTable
-    from hybridlog.query.chunk_columns import Chunk
     from hybridlog.query.predicate.tree import Predicate
     from hybridlog.shared import Shared
-    from hybridlog.snapshot import Snapshot
-    from hybridlog_storage.catalog import RecordingEntry, RecordingSummary
-    from hybridlog_storage.disk.directory import StoreDirectory
     from hybridlog_storage.segments.chunk import StoredChunk
-    from hybridlog_storage.segments.chunk_table import ChunkPlace, ChunkTable
     from hybridlog_storage.segments.segment_reader import SegmentReader
 
 _ROW_BYTES = 44  # of a message's columns in a chunk

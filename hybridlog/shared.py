@@ -7,24 +7,23 @@ from __future__ import annotations
 
 import os
 import threading
-from collections.abc import Callable
+from collections.abc import Callable, Mapping, Sequence
 from functools import lru_cache, partial
 from typing import TYPE_CHECKING, Any, Final
 
 from hybridlog.maintenance.opening import StoreFiles
 from hybridlog.maintenance.report import RepairReport
 from hybridlog.record.marks import MARK_SCHEMA, with_marks
-from hybridlog.snapshot import UNFINISHED
+from hybridlog.snapshot import UNFINISHED, Snapshot
 from hybridlog_storage.cache import Cache, lazy
-from hybridlog_storage.catalog import Catalog, file_of
+from hybridlog_storage.catalog import Catalog, RecordingEntry, RecordingSummary, file_of
 from hybridlog_storage.disk import files
 from hybridlog_storage.errors import SegmentError, StoreError, UsageError
 from hybridlog_storage.manifests import manifests_at
-from hybridlog_storage.messages import schema_hash
-from hybridlog_storage.segments.segment_reader import open_log
+from hybridlog_storage.messages import Batch, schema_hash
+from hybridlog_storage.segments.segment_reader import SegmentReader, open_log
 
 if TYPE_CHECKING:
-    from collections.abc import Mapping, Sequence
     from pathlib import Path
 
     import numpy as np
@@ -34,12 +33,8 @@ if TYPE_CHECKING:
     from hybridlog.columns.tables import Tables
     from hybridlog.query.question import RecordedChannel
     from hybridlog.record.running import RunningRecording
-    from hybridlog.snapshot import Snapshot
-    from hybridlog_storage.catalog import RecordingEntry, RecordingSummary
     from hybridlog_storage.disk.directory import StoreDirectory
     from hybridlog_storage.manifest import File
-    from hybridlog_storage.messages import Batch
-    from hybridlog_storage.segments.segment_reader import SegmentReader
 
 _RESTORE: Final = " Restore it from a copy; `hybridlog verify` shows what is affected."
 

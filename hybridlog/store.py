@@ -19,12 +19,12 @@ from hybridlog.index.access import again_if_lost
 from hybridlog.index.of_store import Index
 from hybridlog.maintenance import edit as edits
 from hybridlog.opened import OpenStore
-from hybridlog.query.choice import Choice, choose
+from hybridlog.query.choice import Choice, During, Tags, Texts, choose
 from hybridlog.query.query import Query, narrowed, of_now
-from hybridlog.query.question import Question
+from hybridlog.query.question import Clock, Question
 from hybridlog.recordings import Recordings
 from hybridlog.session import Asked, Session
-from hybridlog_storage.catalog import RecordingEntry
+from hybridlog_storage.catalog import RecordingEntry, RecordingSummary
 from hybridlog_storage.disk.directory import StoreDirectory
 from hybridlog_storage.errors import (
     StoreError,
@@ -49,14 +49,11 @@ if TYPE_CHECKING:
     from hybridlog.maintenance.sizes import Sizes
     from hybridlog.maintenance.verify import Verification
     from hybridlog.query.answers.statistics import TopicCheck
-    from hybridlog.query.choice import During, Tags, Texts
-    from hybridlog.query.question import Clock
     from hybridlog.query.times import DurationLike, TimeLike
     from hybridlog.record.recorder import RecordOptions, RecordReport
     from hybridlog.sql.engine import SqlAnswer, SqlEngine
     from hybridlog.tf.tree import FrameTree
     from hybridlog.training.lerobot import LerobotOptions, LerobotReport
-    from hybridlog_storage.catalog import RecordingSummary
 
 DEFAULT_STORE = "hybridlog-store"
 Names: TypeAlias = "Iterable[str | RecordingEntry]"

@@ -18,10 +18,10 @@ from msgspec.structs import replace
 from hybridlog.across.match import HOWS, UNKNOWN, interpolated, match, quaternion_paths
 from hybridlog.frames.answer import text_column
 from hybridlog.frames.names import free_name
-from hybridlog.query.answers.completeness import completeness_of, lost_times
+from hybridlog.query.answers.completeness import Completeness, completeness_of, lost_times
 from hybridlog.query.intervals import Intervals, joined
 from hybridlog.query.planner import Planner, bounds_in, log_spans, log_times, resolved
-from hybridlog.query.question import Counters
+from hybridlog.query.question import Clock, Counters, Question, Span
 from hybridlog.query.times import DurationLike, format_duration, parse_duration
 from hybridlog.schema.arrow_types import DURATION, column_of, common_schema, numbers
 from hybridlog.schema.column import STAMP
@@ -37,8 +37,6 @@ if TYPE_CHECKING:
     import pandas as pd
     from numpy.typing import NDArray
 
-    from hybridlog.query.answers.completeness import Completeness
-    from hybridlog.query.question import Clock, Question, Span
     from hybridlog.session import Session
 
 Block = tuple["NDArray[np.int64]", pa.Table]

@@ -15,11 +15,11 @@ import numpy as np
 from msgspec.structs import replace
 
 from hybridlog.across.align import TopicReader
-from hybridlog.message import messages_in
+from hybridlog.message import Message, messages_in
 from hybridlog.query.answers.completeness import completeness_of
 from hybridlog.query.answers.current import picture_of
 from hybridlog.query.planner import Planner, bounds_in, resolved
-from hybridlog.query.question import Counters
+from hybridlog.query.question import Clock, Counters, Question
 from hybridlog.query.times import DurationLike, parse_duration
 from hybridlog.wording import MAX_ROWS, counted, table_html
 from hybridlog_storage.errors import StoreError, TimeError, UsageError
@@ -28,8 +28,6 @@ from hybridlog_storage.times import span_of
 if TYPE_CHECKING:
     from numpy.typing import NDArray
 
-    from hybridlog.message import Message
-    from hybridlog.query.question import Clock, Question
     from hybridlog.session import Session
 
 

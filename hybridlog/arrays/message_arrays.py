@@ -10,7 +10,7 @@ import io
 import re
 import struct
 import warnings
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping, Sequence
 from types import SimpleNamespace
 from typing import TYPE_CHECKING, Any, Final
 
@@ -20,8 +20,6 @@ from hybridlog.arrays import VIDEOS
 from hybridlog_storage.errors import PayloadError, extra
 
 if TYPE_CHECKING:
-    from collections.abc import Callable, Sequence
-
     from numpy.typing import NDArray
 
 POINT_TYPES: Final[Mapping[int, str]] = dict(

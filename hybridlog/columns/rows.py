@@ -10,7 +10,7 @@ rows has those of messages whose payloads are gone.
 
 from __future__ import annotations
 
-from collections.abc import Collection, Iterable, Iterator, Sequence
+from collections.abc import Callable, Collection, Iterable, Iterator, Sequence
 from contextlib import suppress
 from hashlib import sha256
 from operator import attrgetter
@@ -47,6 +47,7 @@ from hybridlog.schema.arrow_types import (
     structs,
 )
 from hybridlog.schema.codec import (
+    Codec,
     Decoded,
     no_messages,
     payload_alone,
@@ -60,17 +61,14 @@ from hybridlog.schema.states import State, state_of
 from hybridlog_storage.cache import Cache
 from hybridlog_storage.errors import StoreError
 from hybridlog_storage.manifest import File, Part, rows_line
-from hybridlog_storage.messages import EXPIRED_IDS, Batch, Left
+from hybridlog_storage.messages import EXPIRED_IDS, Batch, Buffer, Channel, Left
 from hybridlog_storage.segments.segment_file import rows_name
 
 if TYPE_CHECKING:
-    from collections.abc import Callable
     from pathlib import Path
 
     from numpy.typing import NDArray
 
-    from hybridlog.schema.codec import Codec
-    from hybridlog_storage.messages import Buffer, Channel
     from hybridlog_storage.segments.chunk import Placed
 
 

@@ -37,19 +37,17 @@ from hybridlog.columns.layout import (
 from hybridlog.columns.rows import LeftFields, columns_from, rows_of
 from hybridlog.columns.tables import shared_for, shared_name, shared_times, type_folders
 from hybridlog.schema.arrow_types import structs
-from hybridlog.schema.codec import no_messages
+from hybridlog.schema.codec import Decoded, no_messages
 from hybridlog.schema.codecs import codec_for
 from hybridlog.schema.states import encoding_of, state_of
 from hybridlog_storage.disk import files
 from hybridlog_storage.errors import StoreError
-from hybridlog_storage.messages import EXPIRED_IDS, distinct, order_of
+from hybridlog_storage.messages import EXPIRED_IDS, Channel, distinct, order_of
 from hybridlog_storage.settings import read_settings
 
 if TYPE_CHECKING:
     from hybridlog.index.indexing import Messages
-    from hybridlog.schema.codec import Decoded
     from hybridlog_storage.catalog import RecordingEntry
-    from hybridlog_storage.messages import Channel
 
 _PENDING = 16 << 20  # bytes of rows waiting in memory
 _LEFT = _PENDING // 4  # bytes of the smallest topics, which continue to wait for more rows

@@ -28,7 +28,7 @@ import pyarrow as pa
 import pyarrow.compute as pc
 from msgspec import Struct
 
-from hybridlog.columns.column_file import FIRST, ColumnFile, TablePart
+from hybridlog.columns.column_file import FIRST, ColumnFile, Leaf, TablePart
 from hybridlog.columns.fields import joined, records_of
 from hybridlog.columns.layout import (
     OWN_COLUMNS,
@@ -52,7 +52,6 @@ from hybridlog_storage.times import placed, span_of
 if TYPE_CHECKING:
     from numpy.typing import NDArray
 
-    from hybridlog.columns.column_file import Leaf, TablePart
     from hybridlog.query.intervals import Span
     from hybridlog_storage.catalog import ChannelEntry, RecordingEntry
 

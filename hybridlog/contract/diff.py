@@ -10,14 +10,13 @@ from typing import TYPE_CHECKING, Final
 
 from msgspec import Struct
 
-from hybridlog.query.times import format_duration
+from hybridlog.query.times import TimeLike, format_duration
 from hybridlog.query.topics import resolve
 from hybridlog.record.marks import MARKS
 from hybridlog.wording import Rows, counted
 
 if TYPE_CHECKING:
     from hybridlog.query.answers.statistics import FieldStatistics, TopicCheck
-    from hybridlog.query.times import TimeLike
     from hybridlog.recordings import Recordings
 
 Value = float | str | None

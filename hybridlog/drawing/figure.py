@@ -11,9 +11,9 @@ from typing import TYPE_CHECKING, Final
 import numpy as np
 from msgspec import Struct
 
-from hybridlog.drawing.series import Series, known_fields, series
+from hybridlog.drawing.series import Numbers, Series, known_fields, series
 from hybridlog.frames.names import is_summary
-from hybridlog.query.query import narrowed, spans_of
+from hybridlog.query.query import Query, narrowed, spans_of
 from hybridlog.query.times import format_time
 from hybridlog_storage.errors import UsageError, extra
 
@@ -21,9 +21,6 @@ if TYPE_CHECKING:
     from matplotlib.axes import Axes
     from matplotlib.text import Text
     from numpy.typing import NDArray
-
-    from hybridlog.drawing.series import Numbers
-    from hybridlog.query.query import Query
 
 
 DPI: Final = 100

@@ -15,7 +15,7 @@ from msgspec import Struct
 from hybridlog.frames.names import FIELD, is_summary
 from hybridlog.query.answers.statistics import infer_fields
 from hybridlog.query.intervals import GAP_PERIODS, Intervals, Steps
-from hybridlog.query.query import field_types, spans_of, tables_of
+from hybridlog.query.query import Query, field_types, spans_of, tables_of
 from hybridlog.query.times import TIME_LIMIT
 from hybridlog.schema.arrow_types import is_list, is_number, is_time, lengths_of
 from hybridlog.schema.definition_text import NUMERIC, element_of, width_of
@@ -25,7 +25,6 @@ if TYPE_CHECKING:
     from numpy.typing import NDArray
 
     from hybridlog.message import Message
-    from hybridlog.query.query import Query
     from hybridlog.query.question import Span
 
 

@@ -15,7 +15,7 @@ from msgspec import Struct
 from hybridlog.query.answers.interval_queries import IntervalQueries
 from hybridlog.query.intervals import GAP_PERIODS, usual_period
 from hybridlog.query.planner import match_times
-from hybridlog.query.question import Question
+from hybridlog.query.question import Question, Span
 from hybridlog_storage.errors import ResourceError, SegmentError, TopicError
 from hybridlog_storage.times import BEGIN, END, placed
 
@@ -23,7 +23,6 @@ if TYPE_CHECKING:
     from numpy.typing import NDArray
 
     from hybridlog.query.query import Query
-    from hybridlog.query.question import Span
     from hybridlog.session import Session
     from hybridlog_storage.catalog import RecordingEntry
 

@@ -6,7 +6,7 @@ import re
 from collections import Counter
 from contextlib import nullcontext, suppress
 from itertools import chain, pairwise
-from pathlib import PureWindowsPath
+from pathlib import Path, PureWindowsPath
 from stat import S_ISDIR, S_ISREG
 from typing import TYPE_CHECKING, Annotated, Final, TypeAlias
 
@@ -35,7 +35,6 @@ from hybridlog_storage.times import span_of
 
 if TYPE_CHECKING:
     from collections.abc import Iterable, Iterator, Sequence
-    from pathlib import Path
 
     from numpy.typing import NDArray
 

@@ -17,7 +17,7 @@ from contextlib import contextmanager
 from functools import partial
 from hashlib import blake2b
 from pathlib import Path
-from typing import TYPE_CHECKING, BinaryIO, NamedTuple, Self
+from typing import IO, TYPE_CHECKING, BinaryIO, NamedTuple, Self
 
 import numpy as np
 import zstandard
@@ -26,15 +26,13 @@ from msgspec.structs import force_setattr, replace
 
 from hybridlog_storage.disk.files import undone
 from hybridlog_storage.errors import NO_SPACE, SourceError
-from hybridlog_storage.messages import MAX_CHANNELS
+from hybridlog_storage.messages import MAX_CHANNELS, Batch, Channel
 
 if TYPE_CHECKING:
     from collections.abc import Iterator, Sequence
-    from typing import IO
 
     from mcap.records import Metadata
 
-    from hybridlog_storage.messages import Batch, Channel
     from hybridlog_storage.segments.segment_format import Attachment
 
 

@@ -12,7 +12,7 @@ import pyarrow as pa
 from hybridlog.columns.rows import LeftFields
 from hybridlog.frames.names import FIELD, arranged, free_name, is_part, own_columns, summary_of
 from hybridlog.index.indexing import rows_by_channel
-from hybridlog.query.rows import summaries_in
+from hybridlog.query.rows import RowBatch, summaries_in
 from hybridlog.schema.arrow_types import (
     OFFSET_LIMIT,
     TIME,
@@ -28,10 +28,10 @@ from hybridlog.schema.arrow_types import (
     structs,
     with_values,
 )
-from hybridlog.schema.codec import no_messages, stamp_array
+from hybridlog.schema.codec import Decoded, no_messages, stamp_array
 from hybridlog.schema.column import STAMP
 from hybridlog_storage.errors import DefinitionError
-from hybridlog_storage.messages import order_of
+from hybridlog_storage.messages import Batch, order_of
 
 if TYPE_CHECKING:
     from numpy.typing import NDArray
@@ -39,9 +39,6 @@ if TYPE_CHECKING:
     from hybridlog.query.chunk_scan import MessageRun
     from hybridlog.query.planner import Planner
     from hybridlog.query.question import Part, Question, RecordedChannel
-    from hybridlog.query.rows import RowBatch
-    from hybridlog.schema.codec import Decoded
-    from hybridlog_storage.messages import Batch
 
 
 _BLOCK_ROWS = 65_536

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import functools
-from collections.abc import Callable, Iterable, Mapping
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from typing import TYPE_CHECKING, Any, Final
 
 import pyarrow as pa
@@ -27,8 +27,6 @@ from hybridlog.schema.column import Records
 from hybridlog_storage.errors import UsageError
 
 if TYPE_CHECKING:
-    from collections.abc import Iterator, Sequence
-
     from hybridlog.query.chunk_scan import MessageRun
     from hybridlog.query.planner import Planner
 

@@ -14,11 +14,10 @@ from msgspec.structs import replace
 
 from hybridlog.query.times import format_duration, format_time
 from hybridlog.record.marks import CONTRACT
-from hybridlog_storage.manifest import Mark, Pin, new_random, with_mark
+from hybridlog_storage.manifest import Manifest, Mark, Pin, new_random, with_mark
 
 if TYPE_CHECKING:
     from hybridlog.contract import Contract
-    from hybridlog_storage.manifest import Manifest
 
 PINNED: Final = "is marked and pinned"
 RULE: Final = "longest_gap"

@@ -23,7 +23,7 @@ from msgspec.structs import replace
 
 from hybridlog.entries import put_entry
 from hybridlog.entries import text as as_text
-from hybridlog.follow.child import FollowerProcess, Task
+from hybridlog.follow.child import FollowerProcess, Task, Trigger
 from hybridlog.live.clocks import CLOCK, MachineClock, SimulatedTime
 from hybridlog.live.incidents import RULE, Incidents, SilenceWatch
 from hybridlog.live.recording import SMALL_BYTES, LiveOptions, LiveRecording, follow_interval_s
@@ -52,7 +52,6 @@ from hybridlog_storage.messages import REDUCED, Channel, left_channel
 
 if TYPE_CHECKING:
     from hybridlog.contract import Contract
-    from hybridlog.follow.child import Trigger
     from hybridlog.live.sources.base import LiveSource, Sink
     from hybridlog.record.recorder import RecordReport
     from hybridlog.store import Store

@@ -25,7 +25,7 @@ from hybridlog.record.recorder import Capture, RecordReport
 from hybridlog_storage.errors import DatabaseError, DiskFullError, UsageError
 from hybridlog_storage.manifest import Loss
 from hybridlog_storage.mcap.mcap_content import MESSAGE_HEAD
-from hybridlog_storage.messages import Channel, LooseBatch, Schema
+from hybridlog_storage.messages import Buffer, Channel, LooseBatch, Schema
 from hybridlog_storage.segments.segment_format import losses_record
 from hybridlog_storage.segments.segment_writer import SegmentSettings
 
@@ -34,7 +34,6 @@ if TYPE_CHECKING:
     from hybridlog.opened import OpenStore
     from hybridlog.query.topics import TopicMatcher
     from hybridlog_storage.catalog import RecordingEntry
-    from hybridlog_storage.messages import Buffer
 
 
 _WAKE_BYTES = 4 << 20  # queued bytes that wake the writing thread: a batch has a fixed cost

@@ -24,11 +24,7 @@ from hybridlog_storage.mongo.index_documents import IndexState
 from hybridlog_storage.settings import read_settings
 
 if TYPE_CHECKING:
-    from collections.abc import Sequence
-
     from hybridlog.columns.tables import Tables
-    from hybridlog.maintenance.report import Progress, RepairReport
-    from hybridlog.snapshot import Snapshot
     from hybridlog_storage.catalog import Catalog, RecordingEntry, RecordingSummary
     from hybridlog_storage.mongo.database import Database
 

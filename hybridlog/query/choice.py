@@ -16,6 +16,8 @@ from msgspec.structs import replace
 
 from hybridlog.query.times import (
     TIME_LIMIT,
+    DurationLike,
+    TimeLike,
     format_time,
     is_relative,
     parse_duration,
@@ -28,7 +30,6 @@ from hybridlog_storage.errors import TimeError, TopicError, UsageError
 
 if TYPE_CHECKING:
     from hybridlog.query.question import Question
-    from hybridlog.query.times import DurationLike, TimeLike
     from hybridlog.session import Session
     from hybridlog_storage.catalog import RecordingSummary
 

@@ -9,13 +9,11 @@ import numpy as np
 
 from hybridlog_storage.cache import lazy
 from hybridlog_storage.messages import run_starts
-from hybridlog_storage.segments.chunk_table import place_of
+from hybridlog_storage.segments.chunk_table import ChunkPlace, ChunkTable, place_of
 from hybridlog_storage.times import BEGIN, END, placed
 
 if TYPE_CHECKING:
     from numpy.typing import NDArray
-
-    from hybridlog_storage.segments.chunk_table import ChunkPlace, ChunkTable
 
 
 class Chunk(NamedTuple):

@@ -20,9 +20,9 @@ from typing import TYPE_CHECKING
 import numpy as np
 from msgspec import Struct, field
 
-from hybridlog.query.question import Counters
+from hybridlog.query.question import Counters, Part, RecordedChannel
 from hybridlog_storage.errors import StoreError
-from hybridlog_storage.messages import distinct, interleave, order_of
+from hybridlog_storage.messages import Batch, distinct, interleave, order_of
 from hybridlog_storage.stopping import check_wanted
 from hybridlog_storage.times import inside, touches
 
@@ -30,10 +30,8 @@ if TYPE_CHECKING:
     from numpy.typing import NDArray
 
     from hybridlog.query.chunk_columns import Chunk
-    from hybridlog.query.question import Part, RecordedChannel
     from hybridlog.session import Session
     from hybridlog_storage.catalog import RecordingEntry
-    from hybridlog_storage.messages import Batch
     from hybridlog_storage.segments.chunk import StoredChunk
 
 _LOOK_AHEAD = 4

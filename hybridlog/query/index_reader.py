@@ -14,7 +14,7 @@ from msgspec.structs import replace
 from hybridlog.index.access import again_if_lost
 from hybridlog.query.predicate.mongo_filter import misjudged
 from hybridlog.query.predicate.tree import And, Condition, Field, MongoFilter, Predicate
-from hybridlog.query.question import field_types
+from hybridlog.query.question import Counters, Part, field_types
 from hybridlog.record.marks import MARKS
 from hybridlog_storage.errors import StoreError, TopicError, WhereError
 from hybridlog_storage.mongo.index_documents import KEY_BYTES, IndexState, between, collection_of
@@ -24,7 +24,6 @@ from hybridlog_storage.times import END
 if TYPE_CHECKING:
     from numpy.typing import NDArray
 
-    from hybridlog.query.question import Counters, Part
     from hybridlog.session import Session
     from hybridlog_storage.mongo.database import Database
 

@@ -18,13 +18,12 @@ import numpy as np
 
 from hybridlog.arrays import is_video_type
 from hybridlog_storage.errors import DefinitionError, PayloadError
-from hybridlog_storage.messages import Batch
+from hybridlog_storage.messages import Batch, Buffer, Channel
 
 if TYPE_CHECKING:
     from numpy.typing import NDArray
 
     from hybridlog_storage.manifest import Channel as ListedChannel
-    from hybridlog_storage.messages import Buffer, Channel
 
 
 KEEP_ALL: Final = 1 << 62

@@ -13,11 +13,19 @@ import numpy as np
 from msgspec.structs import replace
 
 from hybridlog.query.predicate.tree import And, Condition, Field, Predicate
-from hybridlog.query.question import Counters, Part, windows_in
+from hybridlog.query.question import (
+    Clock,
+    Counters,
+    Part,
+    Question,
+    RecordedChannel,
+    Span,
+    windows_in,
+)
 from hybridlog.query.rows import RowBatch, Rows
 from hybridlog.query.times import format_time, is_early, is_relative, parse_range, parse_time
 from hybridlog.schema.column import STAMP
-from hybridlog.schema.states import GONE
+from hybridlog.schema.states import GONE, State
 from hybridlog.snapshot import UNFINISHED, differing
 from hybridlog.wording import listed
 from hybridlog_storage.cache import lazy
@@ -28,8 +36,6 @@ if TYPE_CHECKING:
     from numpy.typing import NDArray
 
     from hybridlog.query.chunk_scan import MessageRun
-    from hybridlog.query.question import Clock, Question, RecordedChannel, Span
-    from hybridlog.schema.states import State
     from hybridlog.session import Session
     from hybridlog_storage.catalog import RecordingSummary
 

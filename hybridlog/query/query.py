@@ -21,8 +21,8 @@ from msgspec.structs import asdict, replace
 
 from hybridlog.query.choice import Choice, choose
 from hybridlog.query.planner import Planner
-from hybridlog.query.question import Clock, Counters, Question, windows_in
-from hybridlog.query.times import parse_duration, parse_time
+from hybridlog.query.question import Clock, Counters, Question, RecordedChannel, Span, windows_in
+from hybridlog.query.times import DurationLike, TimeLike, parse_duration, parse_time
 from hybridlog.wording import Rows, listed, meant
 from hybridlog_storage.errors import (
     DefinitionError,
@@ -46,8 +46,6 @@ if TYPE_CHECKING:
     from hybridlog.query.answers.statistics import FieldStatistics, TopicCheck
     from hybridlog.query.intervals import Intervals
     from hybridlog.query.predicate.tree import Predicate
-    from hybridlog.query.question import RecordedChannel, Span
-    from hybridlog.query.times import DurationLike, TimeLike
     from hybridlog.session import Asked
     from hybridlog_storage.messages import Batch
 

@@ -17,7 +17,7 @@ from typing import TYPE_CHECKING, Any, NamedTuple, TypeVar
 import numpy as np
 from msgspec.structs import replace
 
-from hybridlog.query.chunk_scan import ChunkKey, ChunkScan, RecordingScan
+from hybridlog.query.chunk_scan import ChunkKey, ChunkScan, MessageRun, RecordingScan
 from hybridlog.query.predicate.tree import is_meta
 from hybridlog_storage.errors import ChangedError, SegmentError, StoreError
 from hybridlog_storage.times import inside, placed
@@ -26,7 +26,6 @@ if TYPE_CHECKING:
     from numpy.typing import NDArray
 
     from hybridlog.columns.tables import TableRows, TopicTable
-    from hybridlog.query.chunk_scan import MessageRun
     from hybridlog.query.question import Counters, Part, RecordedChannel
     from hybridlog.session import Session
 

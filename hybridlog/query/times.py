@@ -33,14 +33,12 @@ import time
 from datetime import UTC, date, datetime, timedelta
 from fractions import Fraction
 from numbers import Integral, Real
-from typing import TYPE_CHECKING, TypeAlias, TypeGuard
+from typing import TYPE_CHECKING, Any, TypeAlias, TypeGuard
 
 from hybridlog_storage.errors import TimeError
 from hybridlog_storage.times import BEGIN, END
 
 if TYPE_CHECKING:
-    from typing import Any
-
     import numpy as np
 
 TimeLike: TypeAlias = (

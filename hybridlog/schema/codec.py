@@ -14,7 +14,7 @@ from msgspec import Struct
 
 from hybridlog.schema.column import STAMP, Records
 from hybridlog_storage.errors import DefinitionError, PayloadError
-from hybridlog_storage.messages import Batch
+from hybridlog_storage.messages import Batch, Buffer
 
 if TYPE_CHECKING:
     from collections.abc import Collection, Mapping
@@ -24,7 +24,6 @@ if TYPE_CHECKING:
 
     from hybridlog.schema.definition import FieldPath
     from hybridlog.schema.objects import Objects
-    from hybridlog_storage.messages import Buffer
 
 
 def no_rows() -> NDArray[np.intp]:

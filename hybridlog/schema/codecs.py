@@ -11,18 +11,16 @@ from typing import TYPE_CHECKING, NoReturn, cast
 import numpy as np
 from msgspec.structs import replace
 
-from hybridlog.schema.codec import Codec, ObjectCodec, OpaqueCodec
+from hybridlog.schema.codec import Codec, Decoded, ObjectCodec, OpaqueCodec
 from hybridlog.schema.column import Records
 from hybridlog.schema.states import CAUSES, State, encoding_of, state_of
 from hybridlog_storage.errors import DefinitionError, PayloadError
-from hybridlog_storage.messages import MARKS_CHANNEL
+from hybridlog_storage.messages import MARKS_CHANNEL, Batch, Buffer, Channel, Schema
 
 if TYPE_CHECKING:
-    from hybridlog.schema.codec import Decoded
     from hybridlog.schema.definition import FieldPath
     from hybridlog.schema.document import BodyGroup
     from hybridlog.schema.objects import Plain
-    from hybridlog_storage.messages import Batch, Buffer, Channel, Schema
 
 _ROS = {("ros1", "ros1msg"), ("cdr", "ros2msg"), ("cdr", "ros2idl"), ("cdr", "omgidl")}
 

@@ -20,6 +20,7 @@ import numpy as np
 from hybridlog.schema.column import (
     LONG,
     Arrays,
+    Column,
     Records,
     Scalars,
     Strings,
@@ -33,7 +34,6 @@ from hybridlog.schema.column import (
 if TYPE_CHECKING:
     from numpy.typing import NDArray
 
-    from hybridlog.schema.column import Column
 
 _DOUBLE, _STRING, _DOCUMENT, _ARRAY, _BOOL, _NULL, _INT32, _INT64 = 1, 2, 3, 4, 8, 10, 16, 18
 

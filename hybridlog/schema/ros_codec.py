@@ -44,7 +44,7 @@ from hybridlog.schema.definition_text import canonical
 from hybridlog.schema.wire_program import Wire, compile_type
 from hybridlog.schema.wire_walk import MisfitError, Scanner, Source, Walker
 from hybridlog_storage.errors import DefinitionError, PayloadError
-from hybridlog_storage.messages import REPLACED, SUPPLIED, Schema, distinct
+from hybridlog_storage.messages import REPLACED, SUPPLIED, Batch, Buffer, Channel, Schema, distinct
 
 if TYPE_CHECKING:
     from collections.abc import Collection, Mapping, Sequence
@@ -52,7 +52,6 @@ if TYPE_CHECKING:
     from numpy.typing import NDArray
     from rosbags.interfaces.typing import FieldDesc, Typesdict
 
-    from hybridlog_storage.messages import Batch, Buffer, Channel, Schema
 
 _HEADER = 4  # bytes in front of a message in CDR
 _LITTLE = 0x0001

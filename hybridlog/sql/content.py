@@ -18,17 +18,14 @@ from msgspec.structs import replace
 from hybridlog.columns.layout import column_names
 from hybridlog.query.answers.interval_queries import marks_in
 from hybridlog.query.planner import resolved
-from hybridlog.query.question import windows_in
-from hybridlog.sql.views import TopicView
-from hybridlog_storage.catalog import ChannelStats
+from hybridlog.query.question import Question, windows_in
+from hybridlog.sql.views import Names, TopicView
+from hybridlog_storage.catalog import ChannelStats, RecordingSummary
 from hybridlog_storage.mongo.index_documents import collection_of
 from hybridlog_storage.times import BEGIN, END, touches
 
 if TYPE_CHECKING:
-    from hybridlog.query.question import Question
     from hybridlog.session import Session
-    from hybridlog.sql.views import Names
-    from hybridlog_storage.catalog import RecordingSummary
 
 TABLES: Final = ("recordings", "topics", "losses", "marks")
 """Tables about the store itself; their names are reserved."""

@@ -23,7 +23,7 @@ from weakref import proxy
 import pyarrow as pa
 from msgspec.structs import replace
 
-from hybridlog.query.answers.completeness import completeness_of
+from hybridlog.query.answers.completeness import Completeness, completeness_of
 from hybridlog.query.question import Question
 from hybridlog.schema.states import without_fields
 from hybridlog.sql.content import TREE, StoreContent, paths_named
@@ -36,7 +36,6 @@ from hybridlog_storage.threads import processors
 if TYPE_CHECKING:
     import pandas as pd
 
-    from hybridlog.query.answers.completeness import Completeness
     from hybridlog.session import Asked
 
 Params = Sequence[Any] | Mapping[str, Any] | None

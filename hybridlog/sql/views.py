@@ -49,13 +49,14 @@ with extra("sql", "SQL needs DuckDB"):
     from duckdb._sources.nodes import Binary, Col, In, Lit, Node
     from duckdb._sources.pyarrow import PyArrowDatasetSource
 
+from hybridlog.query.planner import Resolved
+from hybridlog.query.question import Part, RecordedChannel, Span
+
 if TYPE_CHECKING:
     from pathlib import Path
 
     from hybridlog.columns.tables import TopicTable
     from hybridlog.query.chunk_scan import MessageRun
-    from hybridlog.query.planner import Resolved
-    from hybridlog.query.question import Part, RecordedChannel, Span
     from hybridlog.schema.codec import Decoded
     from hybridlog.session import Session
     from hybridlog_storage.catalog import RecordingEntry

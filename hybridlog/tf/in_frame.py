@@ -23,7 +23,7 @@ from hybridlog.arrays.message_arrays import (
 )
 from hybridlog.formats.places import POSITIONS, poses_among
 from hybridlog.frames import answer
-from hybridlog.message import messages_in
+from hybridlog.message import Message, messages_in
 from hybridlog.query.planner import Planner
 from hybridlog.query.times import decoded_time
 from hybridlog.tf.reader import Trees
@@ -33,7 +33,6 @@ from hybridlog_storage.errors import DefinitionError, PayloadError, TopicError, 
 if TYPE_CHECKING:
     from numpy.typing import NDArray
 
-    from hybridlog.message import Message
     from hybridlog.query.question import Counters, Question
     from hybridlog.session import Session
 

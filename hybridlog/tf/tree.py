@@ -17,15 +17,13 @@ from typing import TYPE_CHECKING, Any, Final
 import numpy as np
 from msgspec import Struct, field
 
-from hybridlog.query.times import format_time, parse_time
+from hybridlog.query.times import TimeLike, format_time, parse_time
 from hybridlog.wording import arrow_html, counted, listed
 from hybridlog_storage.errors import TopicError, TransformError, UsageError
 
 if TYPE_CHECKING:
     import pyarrow as pa
     from numpy.typing import ArrayLike, NDArray
-
-    from hybridlog.query.times import TimeLike
 
     Floats = NDArray[np.float64]
     Times = NDArray[np.int64]

@@ -26,7 +26,15 @@ from hybridlog.formats.writing import failures, new_directory
 from hybridlog.query.pieces import pieces
 from hybridlog.query.query import Query, narrowed
 from hybridlog.query.question import Question
-from hybridlog.training.episodes import IMAGE_PREFIX, episodes, is_depth, pictures
+from hybridlog.training.episodes import (
+    IMAGE_PREFIX,
+    Episode,
+    FeatureMap,
+    OnGap,
+    episodes,
+    is_depth,
+    pictures,
+)
 from hybridlog_storage.errors import (
     DefinitionError,
     MissingDependencyError,
@@ -40,7 +48,6 @@ if TYPE_CHECKING:
     from numpy.typing import ArrayLike, NDArray
 
     from hybridlog.session import Session
-    from hybridlog.training.episodes import Episode, FeatureMap, OnGap
 
 Codec = Literal["h264", "av1"]
 _CODECS: Final[Mapping[Codec, tuple[str, Mapping[str, str]]]] = {

@@ -32,11 +32,10 @@ from hybridlog_storage.manifests import RECORDINGS
 from hybridlog_storage.messages import EXPIRED_IDS, Channel, Schema, schema_hash
 from hybridlog_storage.segments.chunk_table import ChunkTable
 from hybridlog_storage.segments.segment_file import listed_parts, sealed_name
-from hybridlog_storage.segments.segment_reader import GoneLog, open_log
+from hybridlog_storage.segments.segment_reader import GoneLog, SegmentSummary, open_log
 from hybridlog_storage.times import span_of
 
 if TYPE_CHECKING:
-    from hybridlog_storage.segments.segment_reader import SegmentSummary
     from hybridlog_storage.segments.walk import Flushed
 
 MAX_INT: Final = 2**63 - 1

@@ -20,7 +20,7 @@ import secrets
 import stat
 import time
 from abc import ABC, abstractmethod
-from contextlib import ExitStack, contextmanager, suppress
+from contextlib import AbstractContextManager, ExitStack, contextmanager, suppress
 from pathlib import Path
 from typing import TYPE_CHECKING, Final
 
@@ -37,14 +37,13 @@ from hybridlog_storage.manifests import (
     RECORDINGS,
     WRITER_LOCK,
     DiskManifests,
+    Manifests,
 )
 from hybridlog_storage.stopping import pause, safe_point
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Collection, Iterator
-    from contextlib import AbstractContextManager
 
-    from hybridlog_storage.manifests import Manifests
 
 MARK: Final = ".copying-"
 """Prefix of small files in `manifests` that live for a moment."""

@@ -19,7 +19,7 @@ from contextlib import ExitStack, contextmanager, suppress
 from typing import IO, TYPE_CHECKING, Final, Self
 from urllib.parse import unquote, urlsplit
 
-from hybridlog_storage.copy import Place, folder_of
+from hybridlog_storage.copy import Place, Sending, folder_of
 from hybridlog_storage.disk.directory import LOCK, LOCK_WAIT_S
 from hybridlog_storage.errors import (
     ExistsError,
@@ -45,7 +45,6 @@ from hybridlog_storage.stopping import pause, safe_point
 if TYPE_CHECKING:
     from collections.abc import Iterable, Iterator
 
-    from hybridlog_storage.copy import Sending
 
 DEFAULT_SSH: Final = "ssh -o ServerAliveInterval=15"
 """Notices within a minute that a connection is dead."""

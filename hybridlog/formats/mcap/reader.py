@@ -15,7 +15,7 @@ from hybridlog_storage.errors import SourceError
 from hybridlog_storage.mcap import mcap_content
 from hybridlog_storage.mcap.mcap_content import MAGIC, ChunkContent
 from hybridlog_storage.mcap.mcap_scan import Item, Scan
-from hybridlog_storage.messages import Channel, Schema, distinct
+from hybridlog_storage.messages import Batch, Channel, Schema, distinct
 from hybridlog_storage.segments.segment_format import Attachment, reader_of
 from hybridlog_storage.times import END, span_of
 
@@ -26,7 +26,6 @@ if TYPE_CHECKING:
     from mcap.summary import Summary
     from numpy.typing import NDArray
 
-    from hybridlog_storage.messages import Batch
 
 _Definition: TypeAlias = records.Schema | records.Channel
 _UNDEFINED = -1

@@ -8,13 +8,12 @@ from typing import IO, TYPE_CHECKING, Any, cast
 from mcap.writer import CompressionType, Writer
 
 from hybridlog.formats.writing import Answer, LogWriter, Sink, Target
-from hybridlog_storage.segments.segment_format import OUR_NAMES
+from hybridlog_storage.segments.segment_format import OUR_NAMES, Attachment
 
 if TYPE_CHECKING:
     from mcap.records import AttachmentIndex, Statistics
 
     from hybridlog_storage.messages import Batch, Channel, Schema
-    from hybridlog_storage.segments.segment_format import Attachment
 
 
 def source_metadata(channel: Channel) -> dict[str, str]:

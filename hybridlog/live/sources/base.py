@@ -13,7 +13,7 @@ import os
 import socket
 import threading
 from abc import ABC, abstractmethod
-from collections.abc import Callable
+from collections.abc import Callable, Coroutine, Sequence
 from concurrent.futures import Future
 from contextlib import suppress
 from typing import TYPE_CHECKING, Final, NamedTuple, Protocol, Self
@@ -23,8 +23,6 @@ from hybridlog.record.losses import Cause
 from hybridlog_storage.manifest import Loss
 
 if TYPE_CHECKING:
-    from collections.abc import Coroutine, Sequence
-
     from hybridlog_storage.messages import Channel
 
     Addresses = Sequence[tuple[int, tuple[object, ...]]]

@@ -18,7 +18,7 @@ from msgspec.structs import replace
 
 from hybridlog.query.intervals import Intervals
 from hybridlog.query.planner import Planner, bounds_in, resolved
-from hybridlog.query.question import windows_in
+from hybridlog.query.question import Counters, Question, Span, windows_in
 from hybridlog.record.losses import CRASH, Cause, losses_of
 from hybridlog.schema.states import CAUSES, GONE, State, without_fields, without_payload
 from hybridlog.snapshot import UNFINISHED
@@ -27,7 +27,6 @@ from hybridlog_storage.errors import HybridlogError, IncompleteError, TimeError,
 from hybridlog_storage.times import BEGIN, END, span_of, touches
 
 if TYPE_CHECKING:
-    from hybridlog.query.question import Counters, Question, Span
     from hybridlog.session import Session
     from hybridlog_storage.catalog import RecordingEntry, RecordingSummary
 

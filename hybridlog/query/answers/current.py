@@ -20,7 +20,7 @@ from msgspec.structs import replace
 
 from hybridlog.arrays import is_video_type
 from hybridlog.arrays.video import VideoDecoder, frame_of, is_key_frame
-from hybridlog.message import messages_in
+from hybridlog.message import Message, PictureOf, messages_in
 from hybridlog.query import latching
 from hybridlog.query.answers.completeness import lost_times
 from hybridlog.query.chunk_scan import (
@@ -32,7 +32,7 @@ from hybridlog.query.chunk_scan import (
 )
 from hybridlog.query.latching import KEEP_ALL, depth_of, is_video, publisher_of
 from hybridlog.query.planner import Planner, log_spans, resolved
-from hybridlog.query.question import Counters, Question, windows_in
+from hybridlog.query.question import Counters, Question, RecordedChannel, Span, windows_in
 from hybridlog.query.times import TimeLike, parse_time
 from hybridlog.schema.states import CAUSES
 from hybridlog_storage.errors import (
@@ -42,19 +42,14 @@ from hybridlog_storage.errors import (
     SegmentError,
     UsageError,
 )
-from hybridlog_storage.messages import interleave
+from hybridlog_storage.messages import Batch, interleave
 from hybridlog_storage.times import BEGIN, END, earlier, span_of
 
 if TYPE_CHECKING:
-    from collections.abc import Iterator
-
     from numpy.typing import NDArray
 
-    from hybridlog.message import Message, PictureOf
-    from hybridlog.query.question import RecordedChannel, Span
     from hybridlog.session import Session
     from hybridlog_storage.catalog import RecordingEntry, RecordingSummary
-    from hybridlog_storage.messages import Batch
 
 
 _MAX_OPEN = 4

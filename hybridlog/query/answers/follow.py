@@ -13,24 +13,19 @@ from typing import TYPE_CHECKING, Final
 
 from msgspec.structs import replace
 
-from hybridlog.message import messages_in
+from hybridlog.message import Message, messages_in
 from hybridlog.query.answers.completeness import flush_interval_ns
 from hybridlog.query.answers.current import picture_of
-from hybridlog.query.chunk_columns import ChunkColumns
-from hybridlog.query.chunk_scan import RecordingScan
-from hybridlog.query.planner import Planner, bounds_in, resolved
-from hybridlog.query.question import windows_in
+from hybridlog.query.chunk_columns import Chunk, ChunkColumns
+from hybridlog.query.chunk_scan import MessageRun, RecordingScan
+from hybridlog.query.planner import Planner, Resolved, bounds_in, resolved
+from hybridlog.query.question import Counters, Part, Question, Span, windows_in
 from hybridlog.query.topics import later
 from hybridlog.record.marks import MARKS_SEGMENT, without_marks
 from hybridlog_storage.errors import UsageError
 from hybridlog_storage.stopping import pause, safe_point
 
 if TYPE_CHECKING:
-    from hybridlog.message import Message
-    from hybridlog.query.chunk_columns import Chunk
-    from hybridlog.query.chunk_scan import MessageRun
-    from hybridlog.query.planner import Resolved
-    from hybridlog.query.question import Counters, Part, Question, Span
     from hybridlog.session import Asked, Session
     from hybridlog_storage.catalog import RecordingEntry, RecordingSummary
 

@@ -18,7 +18,7 @@ from msgspec.structs import replace
 
 from hybridlog.arrays.message_arrays import plain_type
 from hybridlog.columns.fields import joined
-from hybridlog.message import messages_in
+from hybridlog.message import Message, messages_in
 from hybridlog.query.answers.completeness import lost_times
 from hybridlog.query.intervals import Intervals, changing, clipped, holding
 from hybridlog.query.planner import Planner, log_spans
@@ -43,8 +43,6 @@ from hybridlog_storage.errors import HybridlogError, UsageError, WhereError
 from hybridlog_storage.times import END, earlier, inside, placed
 
 if TYPE_CHECKING:
-    from hybridlog.message import Message
-    from hybridlog.query.question import Counters
     from hybridlog.session import Session
 
 EVENT: Final = "foxglove.Event"

@@ -32,16 +32,14 @@ from hybridlog.view.context import (
     route,
     start_of,
 )
-from hybridlog_storage.catalog import ChannelStats
-from hybridlog_storage.manifest import MAX_MARKS
+from hybridlog_storage.catalog import ChannelStats, RecordingEntry, RecordingSummary
+from hybridlog_storage.manifest import MAX_MARKS, Manifest
 from hybridlog_storage.stopping import held
 
 if TYPE_CHECKING:
     from hybridlog.query.query import Query
     from hybridlog.query.question import Span
     from hybridlog.store import Store
-    from hybridlog_storage.catalog import RecordingEntry, RecordingSummary
-    from hybridlog_storage.manifest import Manifest
 
 # Recordings.
 

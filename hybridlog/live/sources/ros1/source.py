@@ -35,6 +35,7 @@ from hybridlog.live.sources.base import (
     Endpoint,
     LoopSource,
     PeerError,
+    Sink,
     UnreachedError,
     connect,
     endpoint_of,
@@ -48,7 +49,6 @@ from hybridlog_storage.messages import Channel, Schema
 if TYPE_CHECKING:
     from collections.abc import Callable, Coroutine, Iterable, Mapping
 
-    from hybridlog.live.sources.base import Sink
 
 _DEFAULT_URI: Final = "http://localhost:11311"
 _DEFAULT_PORT: Final = 11311

@@ -19,7 +19,7 @@ import time
 from collections import deque
 from typing import TYPE_CHECKING, Final
 
-from hybridlog.live.sources.base import Cause, Loss, one_line
+from hybridlog.live.sources.base import Cause, Loss, Sink, one_line
 from hybridlog.live.sources.sequence_gaps import (
     SequenceGap,
     SequenceGapDetector,
@@ -29,7 +29,6 @@ from hybridlog.live.sources.sequence_gaps import (
 if TYPE_CHECKING:
     from collections.abc import Callable, Sequence
 
-    from hybridlog.live.sources.base import Sink
     from hybridlog_storage.messages import Channel
 
 u32: Final[Callable[..., tuple[int]]] = struct.Struct("<I").unpack_from

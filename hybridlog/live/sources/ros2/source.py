@@ -17,9 +17,9 @@ from contextlib import suppress
 from json import dumps, loads
 from pathlib import Path
 from threading import Thread
-from typing import TYPE_CHECKING, Any
+from typing import IO, TYPE_CHECKING, Any
 
-from hybridlog.live.sources.base import Cause, ThreadedSource, one_line
+from hybridlog.live.sources.base import Cause, Sink, ThreadedSource, one_line
 from hybridlog.live.sources.ros2.child.child import ENTRY, EVENT, HEADER
 from hybridlog_storage.errors import MissingDependencyError, SourceError, UsageError
 from hybridlog_storage.manifest import Loss
@@ -27,9 +27,7 @@ from hybridlog_storage.messages import Channel, Schema
 
 if TYPE_CHECKING:
     from collections.abc import Mapping, Sequence
-    from typing import IO
 
-    from hybridlog.live.sources.base import Sink
 
 MAX_DOMAIN = 232
 

@@ -23,6 +23,7 @@ from contextlib import suppress
 from typing import TYPE_CHECKING, Any
 
 from hybridlog.live.sources.ros2.child.definitions import (
+    Definition,
     Definitions,
     UnknownTypeError,
     parse_type,
@@ -32,7 +33,9 @@ from hybridlog.live.sources.ros2.child.middleware import (
     DEPTH,
     DEPTH_OF_BYTES,
     Middleware,
+    Offer,
     Profile,
+    Subscription,
     offered_text,
     publisher_id,
     request,
@@ -45,8 +48,6 @@ from hybridlog.live.sources.sequence_gaps import (
 if TYPE_CHECKING:
     from collections.abc import Sequence
 
-    from hybridlog.live.sources.ros2.child.definitions import Definition
-    from hybridlog.live.sources.ros2.child.middleware import Offer, Subscription
 
 EVENT = 1
 """Body: a JSON object; its `event` names the kind of event."""
