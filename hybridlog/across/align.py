@@ -16,7 +16,7 @@ import pyarrow as pa
 from msgspec.structs import replace
 
 from hybridlog.across.match import HOWS, UNKNOWN, interpolated, match, quaternion_paths
-from hybridlog.frames.answer import text_column
+from hybridlog.frames.answer import stream, text_column
 from hybridlog.frames.names import free_name
 from hybridlog.query.answers.completeness import Completeness, completeness_of, lost_times
 from hybridlog.query.intervals import Intervals, joined
@@ -26,7 +26,7 @@ from hybridlog.query.times import DurationLike, format_duration, parse_duration
 from hybridlog.schema.arrow_types import DURATION, column_of, common_schema, numbers
 from hybridlog.schema.column import STAMP
 from hybridlog.snapshot import UNFINISHED
-from hybridlog.tf.in_frame import Known, stream
+from hybridlog.tf.in_frame import Known, stream_in_frame
 from hybridlog.tf.reader import Epochs, epochs_of
 from hybridlog.wording import MAX_ROWS, arrow_html, counted, listed
 from hybridlog_storage.cache import lazy
@@ -170,9 +170,11 @@ class TopicReader:
 
     def _stream(self, question: Question, counters: Counters) -> Iterator[pa.Table]:
         with suppress(TimeError):  # the range does not touch the recording
-            for table in stream(Planner(self._session, question, counters), self._trees):
-                if table.num_rows:
-                    yield table
+            planner = Planner(self._session, question, counters)
+            tables = (
+                stream(planner) if question.frame is None else stream_in_frame(planner, self._trees)
+            )
+            yield from (table for table in tables if table.num_rows)
 
     def moments(self, recording: str, span: Span | None = None) -> Moments:
         """The times of all messages beside a recording; no payload is read for log times.
@@ -274,7 +276,8 @@ class TopicReader:
 
     def add(self, columns: dict[str, Any], times: NDArray[np.int64], empty: Empty) -> None:
         """Add the columns of the messages that belong to rows at times, ns, with their distance."""
-        known, apart = self._moments.time, self.epochs(self._recording).apart
+        known = self._moments.time
+        apart = self.epochs(self._recording).apart if self._time == STAMP else None
         found = match(times, known, self.how, self.tolerance, apart)
         if self.how == "interpolate":
             known = known if len(known) else times

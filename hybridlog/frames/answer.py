@@ -11,7 +11,6 @@ import pyarrow as pa
 
 from hybridlog.columns.rows import LeftFields
 from hybridlog.frames.names import FIELD, arranged, free_name, is_part, own_columns, summary_of
-from hybridlog.index.indexing import rows_by_channel
 from hybridlog.query.rows import RowBatch, summaries_in
 from hybridlog.schema.arrow_types import (
     OFFSET_LIMIT,
@@ -31,7 +30,7 @@ from hybridlog.schema.arrow_types import (
 from hybridlog.schema.codec import Decoded, no_messages, stamp_array
 from hybridlog.schema.column import STAMP
 from hybridlog_storage.errors import DefinitionError
-from hybridlog_storage.messages import Batch, order_of
+from hybridlog_storage.messages import Batch, order_of, rows_by_channel
 
 if TYPE_CHECKING:
     from numpy.typing import NDArray

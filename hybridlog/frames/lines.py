@@ -13,7 +13,6 @@ from hybridlog.formats.jsonl import json_line, json_rows
 from hybridlog.formats.writing import Line
 from hybridlog.frames.answer import Decoder, leaves_of, text_column
 from hybridlog.frames.names import arranged, free_name
-from hybridlog.index.indexing import rows_by_channel
 from hybridlog.query.times import format_duration, format_time
 from hybridlog.schema.arrow_types import (
     is_bytes,
@@ -25,6 +24,7 @@ from hybridlog.schema.arrow_types import (
 )
 from hybridlog.schema.column import Records
 from hybridlog_storage.errors import UsageError
+from hybridlog_storage.messages import rows_by_channel
 
 if TYPE_CHECKING:
     from hybridlog.query.chunk_scan import MessageRun

@@ -6,7 +6,7 @@ All that is derived of them needs only chunks and their channels, so it is dispo
 from __future__ import annotations
 
 from collections import defaultdict
-from collections.abc import Hashable, Iterable, Iterator, Mapping, Sequence
+from collections.abc import Hashable, Iterable, Mapping, Sequence
 from typing import TYPE_CHECKING, Final
 
 import numpy as np
@@ -17,7 +17,7 @@ from hybridlog.schema.column import STAMP, Records, header_stamps
 from hybridlog.schema.states import encoding_of
 from hybridlog_storage.cache import lazy
 from hybridlog_storage.catalog import ChannelStats
-from hybridlog_storage.messages import EXPIRED_IDS, Channel, run_starts
+from hybridlog_storage.messages import EXPIRED_IDS, Channel, rows_by_channel
 from hybridlog_storage.mongo.index_documents import DocumentAssembler, IndexState, collection_of
 from hybridlog_storage.segments.chunk import Placed, StoredChunk
 
@@ -104,18 +104,6 @@ def _kind_of(channel: Channel) -> tuple[Hashable, Channel, Codec]:
     about = channel.has_publish_time, channel.is_indexed, codec.reason
     kind = channel.topic, channel.schema, channel.message_encoding, original, *about
     return kind, channel, codec
-
-
-def rows_by_channel(channel: NDArray[np.int32]) -> Iterator[tuple[int, NDArray[np.intp]]]:
-    """Channel ids in a chunk, ascending, and the rows of each, in chunk order."""
-    if len(channel) and bool((channel == channel[0]).all()):
-        yield int(channel[0]), np.arange(len(channel))  # chunks of large messages are small
-        return
-    order = np.argsort(channel, kind="stable")
-    ids = channel[order]
-    starts = run_starts(ids).tolist()
-    for start, end in zip(starts, [*starts[1:], len(ids)], strict=True):
-        yield int(ids[start]), order[start:end]
 
 
 def _stamps_of(messages: Messages) -> tuple[NDArray[np.bool_], NDArray[np.int64]]:

@@ -676,10 +676,12 @@ def _message_at(query: Query, moment: TimeLike) -> Message:
 
 def tables_of(query: Query) -> Iterator[pa.Table]:
     """The answer in order, in Arrow tables of bounded size; at least one, possibly empty."""
-    from hybridlog.tf.in_frame import stream
+    from hybridlog.frames.answer import stream
+    from hybridlog.tf.in_frame import stream_in_frame
 
     query.counters.reset()
-    return stream(Planner(query.source.now(), query.question, query.counters))
+    planner = Planner(query.source.now(), query.question, query.counters)
+    return (stream if planner.question.frame is None else stream_in_frame)(planner)
 
 
 def channels_of(query: Query) -> list[RecordedChannel]:

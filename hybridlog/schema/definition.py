@@ -9,7 +9,6 @@ from __future__ import annotations
 from functools import cache, lru_cache
 from typing import TYPE_CHECKING, Literal, TypeAlias
 
-import numpy as np
 from msgspec import Struct
 
 from hybridlog.schema.definition_text import (
@@ -59,11 +58,6 @@ class Primitive(Struct, frozen=True):
     def size(self) -> int:
         """Its bytes."""
         return int(self.code[1:] or 1)
-
-    @property
-    def dtype(self) -> np.dtype[np.generic]:
-        """Native numpy type."""
-        return np.dtype(self.code)
 
 
 class Text(Struct, frozen=True):

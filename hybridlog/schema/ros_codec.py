@@ -296,7 +296,7 @@ class _Typesdict:
         from rosbags.interfaces import Nodetype
 
         if isinstance(field, Primitive):
-            return _base(field.dtype.name)
+            return _base(np.dtype(field.code).name)
         if isinstance(field, Text):
             return _base("string")
         if isinstance(field, Instant):

@@ -109,10 +109,10 @@ class Source:
 
     def numbers(self, data: NDArray[np.uint8], kind: Primitive) -> NDArray[np.generic]:
         """Gathered bytes as aligned numbers of native byte order."""
-        if kind.dtype.kind == "b":
+        if kind.code == "?":
             return data.astype(np.bool_)
-        values = data.view(kind.dtype.newbyteorder(self.order))
-        return values.astype(kind.dtype, copy=not values.flags.aligned)
+        values = data.view(self.order + kind.code)
+        return values.astype(kind.code, copy=not values.flags.aligned)
 
     def fixed(self, item: Fixed, base: NDArray[np.int64], delta: int) -> Column:
         """The column of a field of fixed size at each `base + delta`."""
@@ -141,10 +141,10 @@ class Source:
     ) -> NDArray[np.generic]:
         if item.width is not None:
             return self.numbers(self.block(base, delta, item.size), kind)
-        if kind.dtype.kind == "b":
+        if kind.code == "?":
             return self.u1(base, delta).astype(np.bool_)
-        values = self._gather(kind.dtype.newbyteorder(self.order), item.size, base, delta)
-        return values.astype(kind.dtype, copy=False)
+        values = self._gather(self.order + kind.code, item.size, base, delta)
+        return values.astype(kind.code, copy=False)
 
 
 def even_offsets(rows: int, width: int) -> NDArray[np.int64]:

@@ -76,14 +76,12 @@ class _Pose(NamedTuple):
         return paths + [f"{self.rotation}.{axis}" for axis in "xyzw" * bool(self.rotation)]
 
 
-def stream(planner: Planner, known: Known | None = None) -> Iterator[pa.Table]:
-    """The tables of an answer, see `frames.answer.stream`; in the frame of the question, if any.
+def stream_in_frame(planner: Planner, known: Known | None = None) -> Iterator[pa.Table]:
+    """The tables of an answer in the frame of its question, see `frames.answer.stream`.
 
     Scans and clouds are lists then, one for each field of their points. Pieces of an answer have
     one `known`, so that transforms are read once.
     """
-    if planner.question.frame is None:
-        return answer.stream(planner)
     looked = _Looked(planner.session, planner.question, planner.counters, known)
     return (_tables_of_points if has_points(planner) else _tables_of_poses)(planner, looked)
 

@@ -31,7 +31,8 @@ from hybridlog_storage.manifest import LOST, File, Manifest
 from hybridlog_storage.manifests import RECORDINGS
 from hybridlog_storage.messages import EXPIRED_IDS, Channel, Schema, schema_hash
 from hybridlog_storage.segments.chunk_table import ChunkTable
-from hybridlog_storage.segments.segment_file import listed_parts, sealed_name
+from hybridlog_storage.segments.segment_file import listed_parts
+from hybridlog_storage.segments.segment_format import sealed_name
 from hybridlog_storage.segments.segment_reader import GoneLog, SegmentSummary, open_log
 from hybridlog_storage.times import span_of
 

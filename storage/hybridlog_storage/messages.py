@@ -56,6 +56,18 @@ def run_starts(values: NDArray[Any]) -> NDArray[np.intp]:
     return starts
 
 
+def rows_by_channel(channel: NDArray[np.int32]) -> Iterator[tuple[int, NDArray[np.intp]]]:
+    """Channel ids in a chunk, ascending, and the rows of each, in chunk order."""
+    if len(channel) and bool((channel == channel[0]).all()):
+        yield int(channel[0]), np.arange(len(channel))  # chunks of large messages are small
+        return
+    order = np.argsort(channel, kind="stable")
+    ids = channel[order]
+    starts = run_starts(ids).tolist()
+    for start, end in zip(starts, [*starts[1:], len(ids)], strict=True):
+        yield int(ids[start]), order[start:end]
+
+
 Buffer = bytes | bytearray | memoryview
 """Contiguous bytes. A memoryview has itemsize 1."""
 

@@ -111,8 +111,8 @@ def test_ros1_words():
     assert fields["t"] == Instant("time", False, False)
     assert fields["d"] == ArrayOf(Instant("duration", True, True), 2)
     assert [name for name, _ in fields["header"].fields] == ["seq", "stamp", "frame_id"]
-    assert fields["b"].dtype == "i1"
-    assert fields["c"].dtype == "u1"
+    assert fields["b"].code == "i1"
+    assert fields["c"].code == "u1"
 
 
 def test_ros2_words():
@@ -120,8 +120,8 @@ def test_ros2_words():
     fields = dict(parse(text).fields)
     assert fields["t"] == Instant("time", True, False)
     assert fields["d"] == Instant("duration", True, False)
-    assert fields["b"].dtype == "u1"
-    assert fields["c"].dtype == "u1"
+    assert fields["b"].code == "u1"
+    assert fields["c"].code == "u1"
     assert [n for n, _ in dict(parse("std_msgs/Header h\n").fields)["h"].fields] == [
         "stamp",
         "frame_id",

@@ -87,7 +87,7 @@ def _nanoseconds(value, kind: Instant, wire: str) -> int:
 
 
 def _assert_numbers(found, kind: Primitive, values, path: str) -> None:
-    assert found.dtype == kind.dtype, path
+    assert found.dtype == np.dtype(kind.code), path
     assert found.dtype.isnative
     assert found.flags.c_contiguous
     assert found.flags.aligned
@@ -96,9 +96,9 @@ def _assert_numbers(found, kind: Primitive, values, path: str) -> None:
         expected = np.asarray(values, np.bool_).view(np.uint8) != 0
     elif kind.name in {"byte", "char"}:
         # rosbags has one signedness for both versions of ROS.
-        expected = (np.asarray(values, np.int64) & 0xFF).astype(np.uint8).view(kind.dtype)
+        expected = (np.asarray(values, np.int64) & 0xFF).astype(np.uint8).view(kind.code)
     else:
-        expected = np.asarray(values, kind.dtype)
+        expected = np.asarray(values, kind.code)
     np.testing.assert_array_equal(found, expected, err_msg=path, strict=True)
 
 

@@ -186,7 +186,6 @@ def page(browser: Browser) -> Iterator[Page]:
 def lane_of(page: Page, topic: str) -> tuple[FloatRect, FloatRect]:
     """Where a lane's name and the picture lie; asked again while the lanes are made anew."""
     row = page.locator(".timeline .name").filter(has_text=topic).first
-    row.scroll_into_view_if_needed()
     for _ in range(60):
         if (lane := row.bounding_box()) and (box := page.locator(".density").bounding_box()):
             return lane, box

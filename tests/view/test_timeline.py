@@ -160,6 +160,7 @@ def test_what_is_lost_is_said(page: Page, demo_store: hl.Store, tmp_path: Path) 
             page.goto(
                 f"{url}#recording=robot&panels=[]&begin={middle - SECOND}&end={middle + SECOND}"
             )
+            page.locator(".timeline .name", has_text=loss["topic"]).scroll_into_view_if_needed()
             lane, box = lane_of(page, loss["topic"])
             page.mouse.move(box["x"] + box["width"] / 2, lane["y"] + lane["height"] / 2)
             tip = page.locator(".tip")

@@ -31,10 +31,10 @@ from hybridlog_storage.manifests import (
 )
 from hybridlog_storage.segments.segment_file import (
     OPEN_SUFFIX,
-    SEALED_SUFFIX,
     is_rows,
     number_of,
 )
+from hybridlog_storage.segments.segment_format import SEALED_SUFFIX
 from hybridlog_storage.settings import NAME as SETTINGS
 from hybridlog_storage.settings import StoreSettings, read_settings, write_settings
 

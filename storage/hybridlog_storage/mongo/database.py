@@ -371,9 +371,9 @@ def _refused(address: str, code: int, text: str) -> HybridlogError:
     if code == _DISK_FULL or "No space left on device" in text:
         return DiskFullError(f"MongoDB at {address} has no space left: {text}")
     text = text.partition(" to execute command")[0]  # which may be long
-    cure = f". {LOGIN_CURE}" if "uthentication" in text else ""
-    if code == _NO_ROLE:  # who may only read asks an index that is complete
-        cure = ". Grant its user the role readWrite on this database"
+    cure = ". Grant its user the role readWrite on this database" if code == _NO_ROLE else ""
+    if "uthentication" in text:
+        cure = f". {LOGIN_CURE}"
     return DatabaseError(f"MongoDB at {address} refuses (error {code}): {text}{cure}")
 
 

@@ -49,6 +49,7 @@ from hybridlog_storage.segments.segment_format import (
     metadata_record,
     record_bytes,
     schema_record,
+    sealed_name,
 )
 
 if TYPE_CHECKING:
@@ -57,7 +58,6 @@ if TYPE_CHECKING:
 
 
 OPEN_SUFFIX = ".mcap.open"
-SEALED_SUFFIX = ".mcap"
 ROWS_SUFFIX = ".rows.parquet"
 _SEALED = re.compile(r"(?P<number>[0-9]{6})\.mcap")
 _ROWS = re.compile(r"[0-9]{6}(\.[1-9][0-9]{0,9})?\.rows\.parquet")
@@ -108,11 +108,6 @@ class Sealed(NamedTuple):
         )
         known = {n: _listed(one) for n, one in sorted(channels.items()) if n < EXPIRED_IDS}
         return cls(file, known)
-
-
-def sealed_name(number: int) -> str:
-    """File name of a sealed segment."""
-    return f"{number:06d}{SEALED_SUFFIX}"
 
 
 def number_of(name: str) -> int | None:

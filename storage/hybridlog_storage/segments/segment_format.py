@@ -48,6 +48,7 @@ if TYPE_CHECKING:
     from numpy.typing import NDArray
 
 
+SEALED_SUFFIX: Final = ".mcap"
 PROFILE: Final = "hybridlog"
 LIBRARY: Final = "hybridlog"
 FORMAT_VERSION: Final = 4
@@ -77,6 +78,11 @@ its indexes."""
 _INDEX: Final = bytes([Opcode.MESSAGE_INDEX])
 _INDEX_ENTRY = RowType(("log_time", "<u8"), ("offset", "<u8"))
 _COUNTS = struct.Struct("<II")  # parts and messages of a chunk
+
+
+def sealed_name(number: int) -> str:
+    """File name of a sealed segment."""
+    return f"{number:06d}{SEALED_SUFFIX}"
 
 
 def record_bytes(record: McapRecord) -> bytes:

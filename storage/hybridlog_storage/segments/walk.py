@@ -42,7 +42,6 @@ from hybridlog_storage.segments.segment_file import (
     Content,
     Sealed,
     SegmentFile,
-    sealed_name,
 )
 from hybridlog_storage.segments.segment_format import (
     ARRIVAL_OPCODE,
@@ -56,6 +55,7 @@ from hybridlog_storage.segments.segment_format import (
     json_of,
     metadata_of,
     schema_of,
+    sealed_name,
     trailer_of,
 )
 from hybridlog_storage.segments.segment_reader import SegmentReader, check_format, open_chunk
