@@ -77,6 +77,18 @@ def adding(store: Path) -> list[subprocess.Popen[bytes]]:
     ]
 
 
+def test_no_edit_of_several_processes_is_lost(store: Path) -> None:
+    manifests, last = DiskManifests(store), 0
+    processes = adding(store)
+    while any(process.poll() is None for process in processes):
+        now = manifests.read(ONE.id)  # never missing, never damaged, never older
+        assert now.changes >= last
+        last = now.changes
+    assert {process.returncode for process in processes} == {0}
+    noted = sorted(note.at for note in manifests.read(ONE.id).notes)
+    assert noted == [*range(400)]
+
+
 def test_nothing_comes_back_after_a_removal(store: Path) -> None:
     manifests = DiskManifests(store)
     processes = adding(store)

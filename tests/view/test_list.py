@@ -90,3 +90,9 @@ def test_a_recording_is_found_and_opened(page: Page, demo_url: str) -> None:
     assert "#recording=robot" in page.url
     page.go_back()
     page.wait_for_selector("text=1 recording:")
+
+
+def test_files_of_the_page_are_kept_by_the_browser(client: TestClient) -> None:
+    first = client.get("app.js")
+    assert first.headers["cache-control"] == "no-cache"
+    assert client.get("app.js", headers={"If-None-Match": first.headers["etag"]}).status_code == 304
