@@ -435,6 +435,7 @@ class _JoinedSource(Source):
             yield replace(batch, channel=numbers[batch.channel])
         self._numbered(inner, numbers)
         self.damage.extend(replace(damage, file=part.path) for damage in inner.damage)
+        self.remarks += inner.remarks
 
     def _numbered(self, inner: Source, numbers: NDArray[np.int32]) -> NDArray[np.int32]:
         """Numbers of the channels of a file in this source.

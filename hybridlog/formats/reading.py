@@ -90,6 +90,7 @@ class Source(ABC):
             every channel of a batch before that batch is yielded. After the last batch it
             holds the channels without messages, too.
         damage: Damaged places found so far. It only grows.
+        remarks: What is odd, where nothing is damaged or lost.
         extras: Metadata and attachments found so far (MCAP only). The consumer removes them
             as it stores them. Attachments can still be read when the source is closed.
         message_count: Number of messages as stated by the log, None if it states none.
@@ -106,6 +107,7 @@ class Source(ABC):
         self.size_bytes: int = sum(size_of(file) for file in self.files)
         self.channels: list[Channel] = []
         self.damage: list[Damage] = []
+        self.remarks: list[str] = []
         self.extras: list[Metadata | Attachment] = []
         self.message_count: int | None = None
         self.time_range: tuple[int, int] | None = None

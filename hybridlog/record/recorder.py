@@ -360,7 +360,7 @@ def record(
         time.monotonic() - started,
         latched=copy.front.messages if copy.front is not None else 0,
         latched_left_out=copy.front.left_out if copy.front is not None else 0,
-        remarks=capture.follower.said,
+        remarks=[*source.remarks, *capture.follower.said],
     )
 
 

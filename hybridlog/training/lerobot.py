@@ -18,6 +18,7 @@ import numpy as np
 import pyarrow as pa
 import pyarrow.parquet as pq
 from msgspec import Struct
+from msgspec.structs import replace
 
 from hybridlog import __version__
 from hybridlog.arrays.video import pyav
@@ -87,7 +88,7 @@ class LerobotOptions(Struct, frozen=True):
         codec: Codec of the pictures.
         on_gap: An episode with a gap in a topic is refused, is cut there, or keeps the last
             value. A message with NaN is none.
-        depth_scale: Metres at 0 and at 255 of pictures of depth, which need it.
+        depth_scale: Metres at 0 and at 255 of pictures of depth, which are left out without.
     """
 
     fps: int
@@ -119,6 +120,7 @@ class LerobotReport:
         dropped: Frames in no episode, since a topic has a gap there.
         missing: Frames that show an earlier picture, since their own cannot be shown.
         lost: Messages that are lost in the episodes.
+        left_out: Topics of depth that are left out, since no scale is given.
         bytes: Size of the files.
     """
 
@@ -129,6 +131,7 @@ class LerobotReport:
     dropped: int = 0
     missing: int = 0
     lost: int = 0
+    left_out: tuple[str, ...] = ()
     bytes: int = 0
 
 
@@ -149,10 +152,10 @@ def write_lerobot(
     features, dropped = features.resolved(session), Counter[str]()
     depths = {topic for topic in features.images.values() if _is_of_depth(query, topic)}
     if depths and options.depth_scale is None:
-        raise UsageError(
-            f"Pictures of depth, {', '.join(sorted(depths))}, need --depth-scale: metres at 0 and "
-            "at 255. Without it, leave them out of the map."
-        )
+        kept = {name: one for name, one in features.images.items() if one not in depths}
+        features, report.left_out = replace(features, images=kept), tuple(sorted(depths))
+        if not features.topics:
+            raise UsageError("Pictures of depth need --depth-scale: metres at 0 and at 255.")
     selected = narrowed(query, *features.topics)
     with failures(str(path)):
         final, unfinished = new_directory(path, "a training set is a directory")

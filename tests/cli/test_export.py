@@ -3,7 +3,11 @@
 from __future__ import annotations
 
 import contextlib
+import json
 from pathlib import Path
+
+import hybridlog as hl
+from hybridlog_storage.messages import Channel
 
 from .running import run
 
@@ -18,6 +22,18 @@ def test_what_is_no_table_is_said_and_left_out(store: Path, tmp_path: Path) -> N
     assert len(list((tmp_path / "x").glob("a__b*.csv"))) == 3
     run("export", tmp_path / "y", "-F", "csv", "-t", "/code", store=store, code=10)
     assert not (tmp_path / "y").exists()
+
+
+def test_names_that_differ_in_case_alone_are_files_on_any_disk(tmp_path: Path) -> None:
+    with hl.open(tmp_path / "store", create=True, mongo="none") as store:
+        with store.start("run") as recording:
+            for topic in ("/Scan", "/scan", "/SCAN"):
+                channel = Channel(topic, "json", None, {})
+                recording.write(channel, json.dumps({"on": topic}).encode(), log_time=10**18)
+    run("export", tmp_path / "x", "-F", "csv", store=tmp_path / "store")
+    files = {path.name.casefold(): path.read_text() for path in (tmp_path / "x").iterdir()}
+    assert len(files) == 3
+    assert all(f"/{name}" in "".join(files.values()) for name in ("Scan", "scan", "SCAN"))
 
 
 def test_a_topic_beside_the_range_is_said_and_left_out(store: Path, tmp_path: Path) -> None:

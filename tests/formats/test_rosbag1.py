@@ -385,6 +385,41 @@ def test_the_definition_is_found_in_the_index_when_its_chunk_is_lost(tmp_path: P
     assert [each.messages_lost for each in damage] == [total(expected) - total(found)]
 
 
+def with_zeros(data: bytes) -> bytes:
+    """A bag with zeros behind each of its index records, which states them in its chunk list."""
+    parts, moved, at = [data[:13]], {}, 13
+    while at < len(data):
+        (size,) = struct.unpack_from("<I", data, at)
+        (length,) = struct.unpack_from("<I", data, at + 4 + size)
+        end = at + 8 + size + length
+        moved[at] = sum(map(len, parts))
+        record = bytearray(data[at:end])
+        if (place := record.find(b"chunk_pos=", 0, size)) > 0:
+            struct.pack_into(
+                "<Q", record, place + 10, moved[struct.unpack_from("<Q", record, place + 10)[0]]
+            )
+        parts.append(bytes(record))
+        if b"op=\x04" in record[: 4 + size] or b"op=\x06" in record[: 4 + size]:
+            parts.append(bytes(20))
+        at = end
+    whole = bytearray(b"".join(parts))
+    place = whole.index(b"index_pos=") + 10
+    struct.pack_into("<Q", whole, place, moved[struct.unpack_from("<Q", whole, place)[0]])
+    return bytes(whole)
+
+
+@pytest.mark.parametrize("compression", ["none", "lz4"])
+def test_zeros_behind_index_records_are_no_damage(tmp_path: Path, compression: str) -> None:
+    path = tmp_path / "a.bag"
+    expected = make(path, compression, chunk=2000, messages=400)
+    path.write_bytes(with_zeros(path.read_bytes()))
+    with Rosbag1Source(path) as source:
+        assert source.message_count == 400
+        assert contents(source) == expected
+        assert source.damage == []
+        assert len(source.remarks) == 1
+
+
 @pytest.mark.parametrize("size", [0, 12, 40])
 def test_zeros_in_place_of_a_chunk_are_damage(tmp_path: Path, size: int) -> None:
     """From the head of the second chunk, or from somewhat before it, to its end."""

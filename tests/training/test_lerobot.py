@@ -412,8 +412,8 @@ def test_depth_has_one_scale_nan_is_a_gap_and_numbers_keep_their_type(tmp_path: 
         with pytest.raises(UsageError, match="gap"):
             store.to_lerobot(query, features, tmp_path / "set", depth_scale=(0, 3), **given)
         given["on_gap"] = "hold"
-        with pytest.raises(UsageError, match="Pictures of depth, /deep, need --depth-scale"):
-            store.to_lerobot(query, features, tmp_path / "set", **given)
+        report = store.to_lerobot(query, features, tmp_path / "set", **given)
+        assert report.left_out == ("/deep",)
         store.to_lerobot(query, features, tmp_path / "scaled", depth_scale=(0, 3), **given)
     info = json.loads((tmp_path / "scaled/meta/info.json").read_text())["features"]
     assert [info[name]["dtype"] for name in ("observation.state", "action")] == [

@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections import Counter
+from collections.abc import Iterable, Sequence
 from contextlib import suppress
 from functools import partial
 from pathlib import Path
@@ -167,7 +168,6 @@ def _write_tables(store: Store, query: Query, form: str, directory: Path, given:
     from hybridlog.formats.writing import failures
     from hybridlog.query.planner import resolved
     from hybridlog.query.query import narrowed
-    from hybridlog_storage.mongo.index_documents import collection_of
 
     resolved(query.source.now(), query.question)  # refuses a range without any message
     topics: Sequence[str] = query.topics
@@ -179,7 +179,7 @@ def _write_tables(store: Store, query: Query, form: str, directory: Path, given:
         if not topics:
             raise UsageError("There is no topic of images or of video.")
     suffix = OUTPUTS[form].suffixes[0]
-    paths = {topic: directory / f"{collection_of(topic)}{suffix}" for topic in topics}
+    paths = {topic: directory / f"{name}{suffix}" for topic, name in _names(topics).items()}
     for path in paths.values():
         check_room(path, force=given.force)
     left_out: list[HybridlogError] = []
@@ -199,6 +199,19 @@ def _write_tables(store: Store, query: Query, form: str, directory: Path, given:
         with suppress(OSError):  # there are files in it
             directory.rmdir()
         raise left_out[0]
+
+
+def _names(topics: Iterable[str]) -> dict[str, str]:
+    """A name of a file for each topic; names that differ in their case alone get a number."""
+    from hybridlog_storage.mongo.index_documents import collection_of
+
+    found, seen = {}, Counter[str]()
+    for topic in topics:
+        name = collection_of(topic)
+        seen[name.casefold()] += 1
+        number = seen[name.casefold()]
+        found[topic] = name if number == 1 else f"{name}~{number}"
+    return found
 
 
 def _print_written(path: Path, query: Query, topic: str = "") -> None:
@@ -273,6 +286,9 @@ def _export_set(store: Store, query: Query, target: Path, given: _Export) -> Non
         "with an earlier picture, since its own cannot be shown": report.missing,
     }
     output.notes(f"{counted(number, 'frame')} {what}." for what, number in said.items() if number)
+    if report.left_out:
+        depths = ", ".join(report.left_out)
+        output.note(f"Pictures of depth are left out without --depth-scale NEAR FAR: {depths}.")
     if report.lost:
         lost = f"{counted(report.lost, 'message')} of these topics are lost in the episodes"
         output.note(f"{lost}; meta/hybridlog.json says in which.")

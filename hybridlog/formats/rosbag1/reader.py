@@ -331,6 +331,9 @@ class Rosbag1Source(Source):
         ends = ((one.offset or 0) + (one.length or 0) for one in self.damage)
         if self._cut and self.size_bytes > max(ends, default=0):
             self._tell(self.size_bytes, 0, *self._cut)
+        if self._got == self.message_count and {one.reason for one in self.damage} == {_NO_RECORD}:
+            self.damage.clear()  # some recorders write zeros there
+            self.remarks.append(f"{self.path}: bytes between its records are no part of it")
         if self.message_count is not None:
             self.settle(self.message_count, self._got)
         if self._undefined:
