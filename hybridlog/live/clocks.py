@@ -116,8 +116,8 @@ class SimulatedTime:
             now = clock_time(channel, payload)
             if now is None:
                 self._recorder.say(
-                    f"{CLOCK} has messages that are no rosgraph_msgs Clock of ROS 1 or ROS 2; they "
-                    "give no time"
+                    f"{CLOCK} has messages that are no rosgraph_msgs Clock of ROS 1 or ROS 2, or "
+                    "whose time cannot be stored; they give no time"
                 )
             else:
                 self._tick(now, received)
@@ -168,7 +168,7 @@ class SimulatedTime:
 
 
 def clock_time(channel: Channel, payload: bytes) -> int | None:
-    """The time in a message of `/clock`, ns; None if it is no clock message."""
+    """The time in a message of `/clock`, ns; None if it is none, or none that can be stored."""
     name = channel.schema.name if channel.schema is not None else ""
     if channel.message_encoding == "ros1" and name == "rosgraph_msgs/Clock":
         form: struct.Struct | None = _ROS1
@@ -179,7 +179,8 @@ def clock_time(channel: Channel, payload: bytes) -> int | None:
     if form is None or len(payload) < form.size:
         return None
     seconds, nanoseconds = form.unpack_from(payload)
-    return int(seconds) * 10**9 + int(nanoseconds)
+    now = int(seconds) * 10**9 + int(nanoseconds)
+    return now if 0 <= now < _MAX_NS else None
 
 
 _MIN_JUMP_NS: Final = 500_000_000  # a smaller difference is a clock that is slowed or sped up

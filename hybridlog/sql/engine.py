@@ -10,7 +10,7 @@ import resource
 import threading
 import time
 from collections import Counter
-from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Generator, Iterable, Iterator, Mapping, Sequence
 from concurrent.futures import Future, ThreadPoolExecutor, wait
 from contextlib import closing, contextmanager, suppress
 from functools import partial
@@ -18,7 +18,7 @@ from importlib import import_module
 from math import inf
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Final, TypeVar
-from weakref import proxy
+from weakref import proxy, ref
 
 import pyarrow as pa
 from msgspec.structs import replace
@@ -261,6 +261,9 @@ class SqlEngine:
             self._content = None
 
 
+_Batches = Generator[pa.RecordBatch, None, None]
+
+
 class SqlAnswer:
     """The answer of a query, computed whenever it is asked for; its store must be open then.
 
@@ -285,6 +288,7 @@ class SqlAnswer:
     ) -> None:
         self._content, self._cursor, self._memory = content, cursor, memory
         self._timeout, self.reading = timeout, Reading(named)
+        self._last: Callable[[], _Batches | None] = lambda: None
         own = proxy(self)  # nothing that the cursor has keeps the answer
         for name in content.named(text):
             view = content.view(name)
@@ -317,7 +321,7 @@ class SqlAnswer:
     def _repr_html_(self) -> str:
         table = self._done
         if table is None:
-            rows = self._batches(MAX_ROWS, self._relation.limit(MAX_ROWS))
+            rows = self._computed(MAX_ROWS, self._relation.limit(MAX_ROWS))
             table = pa.Table.from_batches([*rows])
         return arrow_html(repr(self), table)
 
@@ -369,9 +373,17 @@ class SqlAnswer:
         """
         if self._done is not None:
             return iter(self._done.to_batches())
-        return self._batches(_BATCH_ROWS, self._relation)
+        return self._computed(_BATCH_ROWS, self._relation)
 
-    def _batches(self, size: int, relation: Any) -> Iterator[pa.RecordBatch]:
+    def _computed(self, size: int, relation: Any) -> _Batches:
+        """The answer in batches of so many rows; what was computed last ends."""
+        if (last := self._last()) is not None:
+            last.close()
+        batches = self._batches(size, relation)
+        self._last = ref(batches)
+        return batches
+
+    def _batches(self, size: int, relation: Any) -> _Batches:
         """The answer in batches of so many rows."""
         reading = self.reading = Reading(self.reading.named)
         with (

@@ -215,6 +215,7 @@ def test_messages_that_come_while_the_held_ones_are_passed_on_stay_behind_them(
         ("cdr", "rosgraph_msgs/msg/Clock", b"\0\1\0\0" + struct.pack("<iI", 2, 7), 2 * 10**9 + 7),
         ("cdr", "rosgraph_msgs/msg/Clock", b"\0\0\0\0" + struct.pack(">iI", 2, 7), 2 * 10**9 + 7),
         ("cdr", "rosgraph_msgs/msg/Clock", b"\0\1\0\0" + struct.pack("<i", 2), None),
+        ("cdr", "rosgraph_msgs/msg/Clock", b"\0\1\0\0" + struct.pack("<iI", -5, 0), None),
         ("cdr", "rosgraph_msgs/msg/Clock", b"", None),
         ("cdr", "builtin_interfaces/msg/Time", b"\0\1\0\0" + bytes(8), None),
         ("json", "rosgraph_msgs/Clock", b"{}", None),

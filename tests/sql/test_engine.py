@@ -149,6 +149,14 @@ def test_without_duckdb(root: Path, monkeypatch: pytest.MonkeyPatch) -> None:
             opened.sql("select 1")
 
 
+def test_an_answer_that_is_computed_again_ends_what_was_read_of_it(store: hl.Store) -> None:
+    answer = store.sql("select i8 from large")
+    first = answer.to_batches()
+    next(first)
+    assert answer.to_arrow().num_rows == len(store.sql("select i8 from large").rows())
+    assert list(first) == []
+
+
 def test_a_choice_of_recordings_and_a_time(store: hl.Store) -> None:
     """Views and tables show these alone, and only files of them are read."""
     count = "select count(*) from large"
