@@ -146,40 +146,45 @@ def found_in(topics: Sequence[Stamps]) -> Times:
     begins: list[int] = []
     start = BEGIN
     while True:
-        falls = [_falls(*one, start) for one in topics]
-        for begin in sorted({at for own in falls for at in own}):
-            ends = [(t.searchsorted((start, begin)), len(t)) for t, _ in topics]
-            lasting = [n for n, ((first, at), end) in enumerate(ends) if first < at < end]
-            near = (
-                [lasts for at, lasts in falls[n].items() if begin <= at <= begin + _TOGETHER_NS]
-                for n in lasting
-            )
-            fallen = [one[0] for one in near if one]
-            is_sole = len(lasting) == 1 and ends[lasting[0]][1] < _LEAST_STAMPS
-            if fallen and all(fallen) and not is_sole and 2 * len(fallen) >= len(lasting):
-                break
-        else:
+        falls = [_falls(log_time, stamp, start) for log_time, stamp in topics]
+        candidates = np.unique(np.concatenate([*falls, np.empty(0, np.int64)])).tolist()
+        begin = next((at for at in candidates if _is_epoch(topics, falls, start, at)), None)
+        if begin is None:
             return np.array(begins, np.int64)
         begins.append(begin)
         start = begin
 
 
-def _falls(log_time: Times, stamp: Times, start: int) -> dict[int, bool]:
-    """Log times from a start on at which the stamps of a topic fall; False where they return."""
+def _falls(log_time: Times, stamp: Times, start: int) -> Times:
+    """Log times from a start on at which the stamps of a topic fall."""
     first = int(log_time.searchsorted(start))
     log_time, stamp = log_time[first:], stamp[first:]
     is_low = np.maximum.accumulate(stamp) - stamp > _FALL_NS
-    distance = log_time.astype(np.float64) - stamp
-    places = np.flatnonzero(is_low[1:] & ~is_low[:-1]) + 1
-    # Else they are stamps of several clocks.
-    places = places[distance[places] > np.maximum.accumulate(distance)[places - 1]]
-    ends = log_time.searchsorted(
-        np.minimum(log_time[places], END - _RETURN_NS) + _RETURN_NS, "right"
-    )
-    return {
-        int(log_time[at]): bool((distance[at:end] >= distance[at - 1 : at + 1].mean()).all())
-        for at, end in zip(places.tolist(), ends.tolist(), strict=True)
-    }
+    return log_time[is_low & ~np.concatenate(([False], is_low[:-1]))[: len(is_low)]]
+
+
+def _is_epoch(topics: Sequence[Stamps], falls: Sequence[Times], start: int, begin: int) -> bool:
+    """True if an epoch begins at a log time."""
+    lasting, fallen = [], 0
+    for (log_time, stamp), fall in zip(topics, falls, strict=True):
+        first, at = (int(log_time.searchsorted(time)) for time in (start, begin))
+        if first == at or at == len(log_time):
+            continue
+        lasting.append(len(log_time))
+        place = int(fall.searchsorted(begin))
+        if place == len(fall) or int(fall[place]) > begin + _TOGETHER_NS:
+            continue
+        at = int(log_time.searchsorted(fall[place]))
+        end = int(log_time.searchsorted(min(int(fall[place]) + _RETURN_NS, END), "right"))
+        distance = log_time[first:end].astype(np.float64) - stamp[first:end]
+        before, behind = distance[: at - first], distance[at - first :]
+        if behind[0] <= before.max():
+            continue  # stamps of several clocks
+        if bool((behind < (before[-1] + behind[0]) / 2).any()):
+            return False
+        fallen += 1
+    is_sole = len(lasting) == 1 and lasting[0] < _LEAST_STAMPS
+    return bool(lasting) and not is_sole and 2 * fallen >= len(lasting)
 
 
 def transforms_of(table: pa.Table, topic: int, *, is_static: bool) -> pa.Table:
