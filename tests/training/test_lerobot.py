@@ -414,6 +414,7 @@ def test_depth_has_one_scale_nan_is_a_gap_and_numbers_keep_their_type(tmp_path: 
         given["on_gap"] = "hold"
         report = store.to_lerobot(query, features, tmp_path / "set", **given)
         assert report.left_out == ("/deep",)
+        assert "deep" not in (tmp_path / "set/meta/info.json").read_text()
         store.to_lerobot(query, features, tmp_path / "scaled", depth_scale=(0, 3), **given)
     info = json.loads((tmp_path / "scaled/meta/info.json").read_text())["features"]
     assert [info[name]["dtype"] for name in ("observation.state", "action")] == [

@@ -26,6 +26,23 @@ FOLDER = ROOT.joinpath(*CHILD.split("."))
 A, B = b"a" * 16, b"b" * 16
 
 
+def test_messages_and_events_leave_in_their_order() -> None:
+    sent, at, found = bytearray(), 0, []
+    peer: Any = SimpleNamespace(sendall=sent.extend)
+    box = Outbox(peer)
+    sizes = [0, 5, 32 << 10, 3, 3 << 20, *[20_000] * 100, 1]
+    for number, size in enumerate(sizes):
+        box.message(0, bytes([number % 256]) * size, 10 + number, 0, number)
+    box.event("end")
+    while at < len(sent):
+        kind, size = child.HEADER.unpack_from(sent, at)
+        body = bytes(sent[at + child.HEADER.size :][:size])
+        found.append((kind, body[child.ENTRY.size :] if kind == child.MESSAGE else body))
+        at += child.HEADER.size + size
+    wanted = [(child.MESSAGE, bytes([n % 256]) * size) for n, size in enumerate(sizes)]
+    assert found == [*wanted, (child.EVENT, b'{"event": "end"}')]
+
+
 def test_the_profile_is_there_while_ros_comes_up_and_no_longer(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
