@@ -10,6 +10,7 @@ import pytest
 import hybridlog as hl
 from hybridlog_storage.mongo.database import Database
 from tests.calls import Calls
+from tests.limits import Limit
 from tests.many_topics import topic, write_log
 
 pytestmark = pytest.mark.mongo("embedded")
@@ -28,7 +29,8 @@ def commands_of(calls: Calls) -> Counter[str]:
     return sent
 
 
-def test_a_store_of_many_topics(tmp_path: Path, calls: Calls) -> None:
+def test_a_store_of_many_topics(tmp_path: Path, calls: Calls, limit: Limit) -> None:
+    limit(short_recording_s=60.0)  # it is followed in this process, whose calls are counted
     log = write_log(tmp_path / "log.mcap", 300)
     with hl.open(tmp_path / "store", create=True, require_database=True) as store:
         sent = commands_of(calls)
